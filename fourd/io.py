@@ -1,0 +1,183 @@
+"""Every file format of the workflow: one reader and one writer each. Nothing else opens files.
+
+A writer writes beside the final name, flushes to disk and renames, so a file under its final
+name is always whole. Every file carries `schema_version`.
+"""
+
+import contextlib
+import csv
+import json
+import os
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from fourd.errors import InputError
+
+SCHEMA_VERSION = 1
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path | str) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; rename it to `path` when the block succeeds.
+
+    Raises OSError with `filename` set to the final path when the disk is full.
+    """
+    final = Path(path)
+    final.parent.mkdir(parents=True, exist_ok=True)
+    # The suffix stays last because image writers choose the format by it.
+    temporary = final.with_name(f".{final.stem}.tmp{os.getpid()}{final.suffix}")
+    try:
+        yield temporary
+        with temporary.open("rb") as handle:
+            os.fsync(handle.fileno())
+        temporary.replace(final)
+    except OSError as error:
+        if error.filename in (None, str(temporary)):
+            error.filename = str(final)
+        raise
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write UTF-8 text atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path | str, document: Mapping[str, Any]) -> None:
+    """Write a JSON object with `schema_version`; NaN and infinity are refused (not JSON)."""
+    body = {"schema_version": SCHEMA_VERSION, **document}
+    write_text(path, json.dumps(body, indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path: Path | str) -> dict[str, Any]:
+    """Read a JSON object. Raises InputError if the file is missing or is not a JSON object."""
+    source = Path(path)
+    if not source.is_file():
+        raise InputError(f"expected a JSON file at {source}, found nothing: check the path")
+    try:
+        document = json.loads(source.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"expected JSON in {source}, got: {error}; write the file anew") from None
+    if not isinstance(document, dict):
+        raise InputError(f"expected a JSON object in {source}, got a {type(document).__name__}")
+    return document
+
+
+def write_csv(path: Path | str, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write rows of a table with a header line."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def read_csv(path: Path | str) -> list[dict[str, str]]:
+    """Rows of a CSV table as dictionaries of strings."""
+    with Path(path).open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+class ArchiveWriter:
+    """A stored (uncompressed) .npz that is written one array at a time.
+
+    Memory is one array, not the archive. Member `000012/depth` is written as
+    `000012/depth.npy`, so `numpy.load` reads the file too. Use as a context manager: the file
+    appears under its name when the block ends without an exception.
+    """
+
+    def __init__(self, path: Path | str, meta: Mapping[str, Any] | None = None) -> None:
+        self._path = Path(path)
+        self._meta = {"schema_version": SCHEMA_VERSION, **(meta or {})}
+
+    def __enter__(self) -> "ArchiveWriter":
+        self._context = atomic_path(self._path)
+        self._temporary = self._context.__enter__()
+        self._zip = zipfile.ZipFile(self._temporary, "w", zipfile.ZIP_STORED, allowZip64=True)
+        return self
+
+    def add(self, name: str, array: np.ndarray) -> None:
+        """Append one array under `name`. Time stamps are fixed: same arrays, same bytes."""
+        info = zipfile.ZipInfo(name + ".npy", date_time=(1980, 1, 1, 0, 0, 0))
+        with self._zip.open(info, "w", force_zip64=True) as member:
+            np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+
+    def add_frame(self, frame: int, **arrays: np.ndarray) -> None:
+        """Append the arrays of one frame as `{frame:06d}/{key}`."""
+        for key, array in arrays.items():
+            self.add(f"{frame:06d}/{key}", array)
+
+    def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
+        if kind is None:
+            text = json.dumps(self._meta, allow_nan=False)
+            self.add("meta", np.frombuffer(text.encode(), dtype=np.uint8))
+        # After a failed write (disk full) closing fails again; the first error is the cause.
+        with contextlib.suppress(OSError) if kind is not None else contextlib.nullcontext():
+            self._zip.close()
+        self._context.__exit__(kind, value, traceback)
+
+
+class Archive:
+    """Reader of an `ArchiveWriter` file; arrays are read when asked for."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        try:
+            self._zip = zipfile.ZipFile(self.path)
+            self.meta: dict[str, Any] = json.loads(self["meta"].tobytes())
+        except (zipfile.BadZipFile, KeyError, OSError) as error:
+            raise InputError(
+                f"expected a whole archive of this workflow at {self.path}, got: {error}; "
+                "delete the file and run again"
+            ) from None
+        self._names = {name.removesuffix(".npy") for name in self._zip.namelist()}
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        with self._zip.open(name + ".npy") as member:
+            return np.lib.format.read_array(member, allow_pickle=False)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._names
+
+    def frames(self) -> list[int]:
+        """Sorted frame numbers that have at least one array."""
+        return sorted({int(n.split("/")[0]) for n in self._names if "/" in n})
+
+    def frame(self, frame: int) -> dict[str, np.ndarray]:
+        """All arrays of one frame, by key. Raises KeyError if the frame is not in the file."""
+        prefix = f"{frame:06d}/"
+        names = sorted(n for n in self._names if n.startswith(prefix))
+        if not names:
+            raise KeyError(f"frame {frame} is not in {self.path}")
+        return {name.removeprefix(prefix): self[name] for name in names}
+
+    def close(self) -> None:
+        self._zip.close()
+
+
+def read_image(path: Path | str) -> np.ndarray:
+    """(H, W, 3) uint8, RGB, display-referred (sRGB). Raises InputError if it cannot be decoded."""
+    source = Path(path)
+    if not source.is_file():
+        raise InputError(f"expected an image at {source}, found nothing: check the path")
+    image = cv2.imread(str(source), cv2.IMREAD_COLOR)
+    if image is None:
+        raise InputError(f"expected an image that can be decoded at {source}: replace the file")
+    return np.ascontiguousarray(image[:, :, ::-1])
+
+
+def write_png(path: Path | str, image: np.ndarray) -> None:
+    """Write (H, W, 3) uint8 RGB or (H, W) uint8 atomically as PNG."""
+    array = image[:, :, ::-1] if image.ndim == 3 else image
+    # Encoded in memory: OpenCV's file writer reports a full disk as a silent False.
+    done, data = cv2.imencode(".png", np.ascontiguousarray(array))
+    if not done:
+        raise ValueError(f"cannot encode an array of shape {image.shape} as PNG for {path}")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.tobytes())
