@@ -85,9 +85,8 @@ class Camera:
         if self.is_distorted:
             flat = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-            normalized = cv2.undistortPointsIter(flat, self.K, self.distortion, None, None, criteria).reshape(
-                pixels.shape
-            )
+            normalized = cv2.undistortPoints(flat, self.K, self.distortion, criteria=criteria)
+            normalized = normalized.reshape(pixels.shape)
         else:
             y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
             x = (pixels[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]

@@ -1,0 +1,31 @@
+from snakemake.utils import min_version
+
+min_version("9.27")
+
+
+configfile: "config/config.yaml"
+
+
+include: "rules/common.smk"
+include: "rules/demo.smk"
+include: "rules/ingest.smk"
+include: "rules/sfm.smk"
+include: "rules/views.smk"
+include: "rules/stereo.smk"
+include: "rules/fuse.smk"
+include: "rules/background.smk"
+include: "rules/composition.smk"
+include: "rules/render.smk"
+include: "rules/evaluate.smk"
+
+
+rule render_all:
+    default_target: True
+    input:
+        FILMS,
+        EVALUATION,
+    localrule: True
+
+
+onsuccess:
+    print_finished()

@@ -1,0 +1,275 @@
+"""Configuration and scene files: defaults and checks from the JSON schemas, one sentence per fault."""
+
+import copy
+import dataclasses
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import yaml
+
+from fourd.errors import InputError
+
+SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "config" / "schemas"
+SAMPLES = "samples"
+
+
+def load_yaml(path: Path | str) -> dict[str, Any]:
+    """A YAML mapping. Raises InputError if the file is missing, malformed or no mapping."""
+    source = Path(path)
+    if not source.is_file():
+        raise InputError(f"expected a file at {source}, found nothing: check the name")
+    try:
+        document = yaml.safe_load(source.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"expected YAML in {source}, got: {' '.join(str(error).split())}") from None
+    if not isinstance(document, dict):
+        raise InputError(f"expected a mapping of keys in {source}, got {type(document).__name__}")
+    return document
+
+
+def load_config_schema(folder: Path = SCHEMA_FOLDER) -> dict[str, Any]:
+    """The schema of the whole configuration: config.schema.yaml plus one section per other file."""
+    schema = load_yaml(folder / "config.schema.yaml")
+    for path in sorted(folder.glob("*.schema.yaml")):
+        section = path.name.removesuffix(".schema.yaml")
+        if section not in ("config", "scene"):
+            schema["properties"][section] = load_yaml(path)
+    return schema
+
+
+def fill_defaults(document: dict[str, Any], schema: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a mapping in which missing keys have the schema's defaults, at every depth."""
+    filled = copy.deepcopy(document)
+    for key, entry in schema.get("properties", {}).items():
+        if key not in filled:
+            if "default" in entry:
+                filled[key] = copy.deepcopy(entry["default"])
+            elif entry.get("type") == "object":
+                filled[key] = {}
+            else:
+                continue
+        if isinstance(filled[key], dict):
+            filled[key] = fill_defaults(filled[key], entry)
+    extra = schema.get("additionalProperties")
+    if isinstance(extra, Mapping):
+        for key in set(filled) - set(schema.get("properties", {})):
+            if isinstance(filled[key], dict):
+                filled[key] = fill_defaults(filled[key], extra)
+    return filled
+
+
+def validate(document: Mapping[str, Any], schema: Mapping[str, Any], where: str) -> None:
+    """Check a mapping; raise InputError with key, value and what is allowed for the first fault."""
+    validator = jsonschema.Draft202012Validator(schema)
+    errors = sorted(validator.iter_errors(document), key=lambda e: [str(p) for p in e.absolute_path])
+    if errors:
+        raise InputError(_explain(errors[0], where))
+
+
+def _explain(error: jsonschema.ValidationError, where: str) -> str:
+    key = ".".join(str(part) for part in error.absolute_path) or "the file"
+    rule: Any = error.validator_value
+    if error.validator == "additionalProperties":
+        known = sorted(error.schema.get("properties", {}))  # type: ignore[union-attr]
+        unknown = sorted(set(error.instance) - set(known))  # type: ignore[arg-type]
+        names = ", ".join(map(repr, unknown))
+        return f"{where}: unknown key {names} in {key}; known keys are {', '.join(known)}"
+    if error.validator == "required":
+        return f"{where}: {error.message} in {key}"
+    allowed = {
+        "type": f"type {rule}",
+        "enum": f"one of {rule}",
+        "minimum": f"at least {rule}",
+        "maximum": f"at most {rule}",
+        "exclusiveMinimum": f"more than {rule}",
+        "exclusiveMaximum": f"less than {rule}",
+        "pattern": f"text that matches {rule}",
+        "minItems": f"at least {rule} entries",
+        "maxItems": f"at most {rule} entries",
+    }.get(str(error.validator), error.message)
+    return f"{where}: {key} is {error.instance!r}, expected {allowed}"
+
+
+def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of `above` win over those of `below`, section by section."""
+    merged = dict(below)
+    for key, value in above.items():
+        if isinstance(value, Mapping) and isinstance(merged.get(key), Mapping):
+            merged[key] = merge(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraSource:
+    """Where a physical camera's frames come from (scene file, `cameras`)."""
+
+    source: str
+    offset_s: float
+    calibration_name: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """The facts of one event, checked."""
+
+    name: str
+    fps: float
+    num_frames: int
+    size: tuple[int, int]
+    cameras: dict[str, CameraSource]
+    heldout: tuple[str, ...]
+    calibration: tuple[str, ...]
+    calibration_format: str
+    depth_range: tuple[float, float] | None
+    labels: str | None
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Cameras that everything is made from, in the scene's order."""
+        return tuple(name for name in self.cameras if name not in self.heldout)
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """All N-choose-2 pairs of input cameras, LEFT-RIGHT in the scene's order."""
+        return tuple(f"{left}-{right}" for left, right in itertools.combinations(self.inputs, 2))
+
+
+def load_scene(name: str, folder: Path | str = "config/scenes") -> tuple[Scene, dict[str, Any]]:
+    """A scene file, checked, and the settings it carries. Raises InputError."""
+    path = Path(folder) / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in Path(folder).glob("*.yaml"))) or "none"
+        raise InputError(
+            f"scene {name!r}: expected a file at {path}, found nothing; known scenes are {known}. "
+            f"`python -m fourd.init {name} VIDEO_OR_FOLDER...` writes one"
+        )
+    document = load_yaml(path)
+    schema = load_yaml(SCHEMA_FOLDER / "scene.schema.yaml")
+    validate(document, schema, str(path))
+    document = fill_defaults(document, schema)
+    cameras = {
+        camera: CameraSource(entry["source"], entry["offset_s"], entry["calibration_name"] or camera)
+        for camera, entry in document["cameras"].items()
+    }
+    scene = Scene(
+        name=name,
+        fps=document["fps"],
+        num_frames=document["num_frames"],
+        size=tuple(document["size"]),
+        cameras=cameras,
+        heldout=tuple(document["heldout"]),
+        calibration=tuple(document["calibration"]),
+        calibration_format=document["calibration_format"],
+        depth_range=None if document["depth_range"] is None else tuple(document["depth_range"]),
+        labels=document["labels"],
+    )
+    _check_scene(scene, str(path))
+    return scene, document["settings"]
+
+
+def _check_scene(scene: Scene, where: str) -> None:
+    for name in scene.heldout:
+        if name not in scene.cameras:
+            raise InputError(
+                f"{where}: heldout names {name!r}, which is no camera; cameras are {', '.join(scene.cameras)}"
+            )
+    if len(scene.inputs) < 2:
+        raise InputError(
+            f"{where}: expected at least 2 cameras that are not held out, got {len(scene.inputs)}: "
+            "depth needs two views, add cameras or hold out fewer"
+        )
+    if scene.depth_range is not None and scene.depth_range[0] >= scene.depth_range[1]:
+        raise InputError(f"{where}: depth_range is {list(scene.depth_range)}, expected near less than far")
+
+
+def load_config(given: Mapping[str, Any], scene_settings: Mapping[str, Any], scene: str) -> dict[str, Any]:
+    """The full configuration: schema defaults, below the scene's settings, below what was given."""
+    schema = load_config_schema()
+    validate(given, schema, "configuration")
+    validate(scene_settings, schema, f"scene {scene}, settings")
+    return fill_defaults(merge(scene_settings, given), schema)
+
+
+def chunk_names(num_frames: int, chunk_frames: int) -> tuple[str, ...]:
+    """Chunks `FIRST-LAST` (inclusive) that cover frames 0 .. num_frames - 1; the last may be short."""
+    return tuple(
+        f"{first:06d}-{min(first + chunk_frames, num_frames) - 1:06d}"
+        for first in range(0, num_frames, chunk_frames)
+    )
+
+
+def frames_of_chunk(chunk: str) -> range:
+    """Frames of a chunk name."""
+    first, last = chunk.split("-")
+    return range(int(first), int(last) + 1)
+
+
+def spread_frames(num_frames: int, count: int) -> tuple[int, ...]:
+    """`count` frames (or all, if fewer) evenly spread over the clip, each in the middle of its share."""
+    count = min(count, num_frames)
+    return tuple((2 * i + 1) * num_frames // (2 * count) for i in range(count))
+
+
+def stage_version(stage: str) -> int:
+    """`STAGE_VERSION` of a stage's module, read without importing it (imports cost seconds).
+
+    Passed as a parameter of the rule, it makes a change of code visible to the workflow engine.
+    """
+    package = Path(__file__).resolve().parent / stage
+    source = package / "__init__.py" if package.is_dir() else package.with_suffix(".py")
+    for line in source.read_text(encoding="utf-8").splitlines():
+        if line.startswith("STAGE_VERSION = "):
+            return int(line.removeprefix("STAGE_VERSION = "))
+    raise InputError(f"{source}: expected a line STAGE_VERSION = NUMBER, found none: add it")
+
+
+def num_levels(scene: Scene, config: Mapping[str, Any]) -> int:
+    """Resolutions of the composition that the films' size calls for (paper 4.1).
+
+    The paper's levels are 270, 540 and 1080 lines. A level is left out when the films have fewer
+    than three quarters of its lines; `composition.max_levels` bounds the number further.
+    """
+    lines = min(scene.size)
+    wanted = 1 + sum(lines >= 0.75 * level_lines for level_lines in (540, 1080))
+    return min(wanted, config["composition"].get("max_levels", 3))
+
+
+def fit_chunk_frames(config: Mapping[str, Any], scene: Scene) -> int:
+    """`chunk_frames`, refused with a proposal when the number of jobs would be unworkable."""
+    chunk_frames = config["chunk_frames"]
+
+    def estimate_jobs(frames: int) -> int:
+        chunks = -(-scene.num_frames // frames)
+        views = len(scene.cameras) + len(config["trajectories"])
+        return len(scene.pairs) * (chunks + 2) + views * (3 * chunks + 2) + 2 * len(scene.cameras)
+
+    if estimate_jobs(chunk_frames) > config["max_jobs"]:
+        fits = chunk_frames
+        while estimate_jobs(fits) > config["max_jobs"] and fits < scene.num_frames:
+            fits *= 2
+        raise InputError(
+            f"scene {scene.name} with chunk_frames {chunk_frames} means about "
+            f"{estimate_jobs(chunk_frames)} jobs, more than max_jobs {config['max_jobs']}: "
+            f"use chunk_frames {min(fits, scene.num_frames)} or more, or raise max_jobs"
+        )
+    return chunk_frames
+
+
+def check_sources(scene: Scene, made_by_rules: tuple[str, ...]) -> None:
+    """Raise InputError for the first source or calibration file that is not there.
+
+    made_by_rules: beginnings of paths that the workflow itself makes
+    """
+    named = {f"camera {name}": camera.source for name, camera in scene.cameras.items()}
+    named |= {f"calibration file {i + 1}": path for i, path in enumerate(scene.calibration)}
+    for what, path in named.items():
+        if not path.startswith(made_by_rules) and not Path(path).exists():
+            raise InputError(
+                f"scene {scene.name}, {what}: expected a file or folder at {path}, found nothing: "
+                f"correct the path in config/scenes/{scene.name}.yaml (paths start at {Path.cwd()})"
+            )

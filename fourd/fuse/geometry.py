@@ -1,0 +1,181 @@
+"""From a rectified camera to the target and from the target to a source image, as linear maps.
+
+A point on the ray of pixel (x, y) of a rectified camera at inverse depth s = 1 / z is, in the world,
+`R.T @ K^-1 @ [x, y, 1] / s + center`. Its homogeneous position in the target, times s, is
+
+    P(x, y) = A @ [x, y, 1] + s * b        A = K_t R_t R.T K^-1,  b = K_t (R_t center + t_t)
+
+so that (u, v) = (P0, P1) / P2 and the inverse depth in the target is s / P2. Nothing divides by s:
+points at infinity are ordinary.
+"""
+
+import dataclasses
+from typing import Protocol
+
+import numpy as np
+
+from fourd.camera import Camera
+
+
+class PairDisparity(Protocol):
+    """What fusion reads of one pair at one frame (`docs/formats.md`, disparity).
+
+    left, right: names of the cameras;  K_left, K_right, R: (3, 3) rectified_from_world
+    center_left, center_right: (3,) world;  baseline: world units;  sigma_px: noise at confidence 1
+    *_disparity: (H, W) float32 px, NaN where invalid;  *_confidence: (H, W) float32 in 0..1
+    """
+
+    @property
+    def left(self) -> str: ...
+    @property
+    def right(self) -> str: ...
+    @property
+    def K_left(self) -> np.ndarray: ...
+    @property
+    def K_right(self) -> np.ndarray: ...
+    @property
+    def R(self) -> np.ndarray: ...
+    @property
+    def center_left(self) -> np.ndarray: ...
+    @property
+    def center_right(self) -> np.ndarray: ...
+    @property
+    def baseline(self) -> float: ...
+    @property
+    def sigma_px(self) -> float: ...
+    @property
+    def left_disparity(self) -> np.ndarray: ...
+    @property
+    def right_disparity(self) -> np.ndarray: ...
+    @property
+    def left_confidence(self) -> np.ndarray: ...
+    @property
+    def right_confidence(self) -> np.ndarray: ...
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DisparityMap:
+    """One disparity map and where its pixels go in the target.
+
+    A: (3, 3), b: (3,) float32, as in the module's docstring
+    disparity, confidence: (H, W) float32;  disparity_at_infinity: px
+    inverse_depth_per_px: 1 / (focal_px * baseline);  sigma_px: noise at confidence 1
+    """
+
+    A: np.ndarray
+    b: np.ndarray
+    disparity: np.ndarray
+    confidence: np.ndarray
+    disparity_at_infinity: np.float32
+    inverse_depth_per_px: np.float32
+    sigma_px: np.float32
+
+
+def maps_of_pair(pair: PairDisparity, target: Camera) -> tuple[DisparityMap, DisparityMap]:
+    """The left and the right disparity map of a pair with their projections to the target."""
+    per_px = 1.0 / (pair.K_left[0, 0] * pair.baseline)
+    shared = (
+        np.float32(pair.K_left[0, 2] - pair.K_right[0, 2]),
+        np.float32(per_px),
+        np.float32(pair.sigma_px),
+    )
+    left = _linear_map(target, pair.K_left, pair.R, pair.center_left)
+    right = _linear_map(target, pair.K_right, pair.R, pair.center_right)
+    return (
+        DisparityMap(*left, pair.left_disparity, pair.left_confidence, *shared),
+        DisparityMap(*right, pair.right_disparity, pair.right_confidence, *shared),
+    )
+
+
+def _linear_map(
+    target: Camera, K: np.ndarray, R: np.ndarray, center: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    A = target.K @ target.R @ R.T @ np.linalg.inv(K)
+    b = target.K @ (target.R @ center + target.t)
+    return A.astype(np.float32), b.astype(np.float32)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sources:
+    """The original images and how target pixels map to them; C cameras.
+
+    names: (C,) bit and index of every camera in masks and `source`
+    A: (C, 3, 3), b: (C, 3) float32: target pixel and inverse depth to homogeneous image plane
+    lens: (C, 9) float32: fx, skew, cx, fy, cy, largest squared radius of the image plane,
+        target focal length over source focal length, width - 1, height - 1
+    distortion: (C, 5) float32;  images: C arrays (H, W, 3) uint8
+    """
+
+    names: tuple[str, ...]
+    A: np.ndarray
+    b: np.ndarray
+    lens: np.ndarray
+    distortion: np.ndarray
+    images: tuple[np.ndarray, ...]
+
+
+def make_sources(target: Camera, cameras: dict[str, Camera], images: dict[str, np.ndarray]) -> Sources:
+    """Sources in the order of `images`; the cameras are those of the same instant."""
+    names = tuple(images)
+    ray_from_pixel = np.linalg.inv(target.K)
+    A, b, lens = [], [], []
+    for name in names:
+        camera = cameras[name]
+        source_from_target = camera.R @ target.R.T
+        A.append(source_from_target @ ray_from_pixel)
+        b.append(camera.t - source_from_target @ target.t)
+        width, height = camera.size
+        K = camera.K
+        lens.append(
+            [K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2], _largest_radius_squared(camera)]
+            + [target.focal_px / camera.focal_px, width - 1, height - 1]
+        )
+    count = len(names)
+    return Sources(
+        names,
+        np.reshape(A, (count, 3, 3)).astype(np.float32),
+        np.reshape(b, (count, 3)).astype(np.float32),
+        np.reshape(lens, (count, 9)).astype(np.float32),
+        np.reshape([cameras[n].distortion for n in names], (count, 5)).astype(np.float32),
+        tuple(np.ascontiguousarray(images[n]) for n in names),
+    )
+
+
+def _largest_radius_squared(camera: Camera) -> float:
+    """Squared radius on the image plane (z = 1) that the image's border reaches.
+
+    A strong negative k1 folds rays from far outside back into the image; they stop here.
+    """
+    width, height = camera.size
+    x = np.linspace(0, width - 1, 9)
+    y = np.linspace(0, height - 1, 9)
+    border = [(a, b) for a in x for b in (0, height - 1)] + [(a, b) for a in (0, width - 1) for b in y]
+    rays = camera.rays(np.asarray(border, dtype=np.float64))
+    return float((rays[:, :2] ** 2).sum(axis=1).max()) * 1.02
+
+
+def source_rows(
+    disparity_map: DisparityMap, tile_rows: tuple[int, int], inverse_depths: tuple[float, float]
+) -> tuple[int, int]:
+    """Range of rows of a disparity map that can touch rows [first, last) of the target.
+
+    inverse_depths: least and greatest in the map, source frame, world units^-1
+    Returns (first, last); a superset, because only bounds enter. Where P2 > 0 at the four corners
+    of a source row's (x, s) rectangle, v is a ratio of two linear functions and is extreme there.
+    """
+    height, width = disparity_map.disparity.shape
+    A, b = disparity_map.A.astype(np.float64), disparity_map.b.astype(np.float64)
+    y = np.arange(height, dtype=np.float64)
+    low, high = np.full(height, np.inf), np.full(height, -np.inf)
+    always = np.zeros(height, dtype=bool)
+    for x in (0.0, width - 1.0):
+        for s in inverse_depths:
+            v1 = A[1, 0] * x + A[1, 1] * y + A[1, 2] + s * b[1]
+            v2 = A[2, 0] * x + A[2, 1] * y + A[2, 2] + s * b[2]
+            always |= v2 <= 1e-6 * np.abs(A[2]).max()
+            v = v1 / np.where(v2 > 0, v2, 1.0)
+            low, high = np.minimum(low, v), np.maximum(high, v)
+    # One more row for rounding in float32.
+    margin = 17.0
+    touched = np.flatnonzero(always | ((low - margin < tile_rows[1]) & (high + margin >= tile_rows[0])))
+    return (int(touched[0]), int(touched[-1]) + 1) if touched.size else (0, 0)

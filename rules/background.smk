@@ -1,0 +1,35 @@
+"""Static background: the temporal median of what lies farthest, for every pose of a view."""
+
+
+def sample_disparities(wildcards):
+    return expand(
+        "<results>/{scene}/disparity/{pair}/samples.npz",
+        scene=wildcards.scene,
+        pair=pairs_without(wildcards.view),
+    )
+
+
+rule estimate_background:
+    input:
+        view="<results>/{scene}/views/{view}.json",
+        cameras="<results>/{scene}/sfm/cameras.json",
+        ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
+        disparity=sample_disparities,
+    output:
+        temp("<results>/{scene}/background/{view}/{chunk}.npz"),
+    log:
+        "<logs>/{scene}/estimate_background/{view}/{chunk}.log",
+    benchmark:
+        "<benchmarks>/{scene}/estimate_background/{view}/{chunk}.tsv"
+    priority: 10
+    conda:
+        "../envs/torch.yaml"
+    threads: 1
+    params:
+        frames=lambda wildcards: frames_of_view(wildcards.view, wildcards.chunk),
+        options=options("background"),
+        version=fourd_config.stage_version("background"),
+    shell:
+        "python -m fourd.background --view-file {input.view} --cameras {input.cameras}"
+        " --frames {params.frames} --disparity {input.disparity} --ingest {input.ingest}"
+        " {params.options} --output {output} 2> {log}"

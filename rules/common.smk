@@ -1,0 +1,120 @@
+"""Checked configuration, the lists that span the job graph, and helper functions of the rules."""
+
+import os
+import sys
+from pathlib import Path
+
+from snakemake.exceptions import WorkflowError
+
+sys.path.insert(0, workflow.basedir)
+# Jobs start `python -m fourd.<stage>`; they find the package beside the Snakefile, installed or not.
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    filter(None, [str(workflow.basedir), os.environ.get("PYTHONPATH")])
+)
+
+from fourd import config as fourd_config
+from fourd import trajectory
+from fourd.cli import flags_from_mapping
+from fourd.errors import InputError
+
+try:
+    fourd_config.validate(config, fourd_config.load_config_schema(), "configuration")
+    SCENE, _scene_settings = fourd_config.load_scene(config.get("scene", "demo"))
+    config = fourd_config.load_config(config, _scene_settings, SCENE.name)
+    CHUNK_FRAMES = fourd_config.fit_chunk_frames(config, SCENE)
+    # What rules make or fetch need not be there yet.
+    fourd_config.check_sources(SCENE, made_by_rules=("data/demo/", "data/pose2sim/"))
+except InputError as error:
+    raise WorkflowError(str(error)) from None
+
+TRAJECTORIES = config["trajectories"]
+CHUNKS = fourd_config.chunk_names(SCENE.num_frames, CHUNK_FRAMES)
+LEVELS = range(fourd_config.num_levels(SCENE, config))
+SAMPLE_FRAMES = fourd_config.spread_frames(SCENE.num_frames, config["background"]["num_samples"])
+
+# Output frame -> scene frame, for every place that is filmed from.
+VIEW_FRAMES = {
+    **{
+        cam: {f: f for f in fourd_config.spread_frames(SCENE.num_frames, config["views"][key])}
+        for cams, key in ((SCENE.inputs, "train_frames"), (SCENE.heldout, "heldout_frames"))
+        for cam in cams
+    },
+    **{
+        name: dict(enumerate(trajectory.scene_frames(spec, SCENE.num_frames)))
+        for name, spec in TRAJECTORIES.items()
+    },
+}
+
+
+def chunks_of_view(view):
+    """Chunks of output frames in which a view has any."""
+    last = max(VIEW_FRAMES[view])
+    names = fourd_config.chunk_names(last + 1, CHUNK_FRAMES)
+    return [c for c in names if frames_of_view(view, c)]
+
+
+def frames_of_view(view, chunk):
+    """Output frames of a view in a chunk."""
+    return [f for f in fourd_config.frames_of_chunk(chunk) if f in VIEW_FRAMES[view]]
+
+
+def scene_chunks(view, chunk):
+    """Chunks of the scene's clock that show up in a chunk of output frames."""
+    frames = [VIEW_FRAMES[view][f] for f in frames_of_view(view, chunk)]
+    return sorted({CHUNKS[f // CHUNK_FRAMES] for f in frames})
+
+
+def pairs_without(view):
+    """Pairs that may serve a view: a camera never helps to predict itself."""
+    return [p for p in SCENE.pairs if view not in p.split("-")]
+
+
+def options(section):
+    """A section of the configuration as command-line flags."""
+    return flags_from_mapping(config[section])
+
+
+def chunk_priority(wildcards):
+    """Earlier chunks first, so that temporary files of few chunks are alive at a time."""
+    return (
+        0 if wildcards.chunk == "samples" else -(int(wildcards.chunk.split("-")[0]) // CHUNK_FRAMES)
+    )
+
+
+def named(paths, names):
+    """`name=path` words for flags that map cameras to files."""
+    return [f"{name}={path}" for name, path in zip(names, paths, strict=True)]
+
+
+FILMS = expand(
+    "<results>/{scene}/render/{trajectory}.mp4", scene=SCENE.name, trajectory=TRAJECTORIES
+)
+EVALUATION = (
+    expand(
+        "<results>/{scene}/evaluate/{file}",
+        scene=SCENE.name,
+        file=["metrics.csv", "table.md", "contact_sheet.png"],
+    )
+    if SCENE.heldout
+    else []
+)
+
+
+def print_finished():
+    """Where to look, when everything is done."""
+    folder = Path(config["pathvars"].get("results", "results")) / SCENE.name
+    films = [p for p in (folder / "render" / f"{name}.mp4" for name in TRAJECTORIES) if p.is_file()]
+    table = folder / "evaluate" / "table.md"
+    print(f"\nFilms of {SCENE.name}:", *(f"  {film}" for film in films), sep="\n")
+    if SCENE.heldout and table.is_file():
+        print(f"\n{table.read_text()}\nPictures: {folder / 'evaluate' / 'contact_sheet.png'}")
+
+
+wildcard_constraints:
+    scene=SCENE.name,
+    cam="|".join(SCENE.cameras),
+    view="|".join([*SCENE.cameras, *TRAJECTORIES]),
+    trajectory="|".join(TRAJECTORIES) or "none",
+    pair="|".join(SCENE.pairs),
+    chunk=r"\d{6}-\d{6}|samples",
+    level=r"[012]",

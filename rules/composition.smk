@@ -1,0 +1,40 @@
+"""Three independent generators, from coarse to fine."""
+
+
+def training_files(stage):
+    return [
+        f"<results>/{SCENE.name}/{stage}/{cam}/{chunk}.npz"
+        for cam in SCENE.inputs
+        for chunk in chunks_of_view(cam)
+    ]
+
+
+rule train_level:
+    input:
+        views=expand("<results>/{{scene}}/views/{cam}.json", cam=SCENE.inputs),
+        cameras="<results>/{scene}/sfm/cameras.json",
+        ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
+        foreground=training_files("foreground"),
+        background=training_files("background"),
+    output:
+        model="<results>/{scene}/composition/{level}/model.pt",
+        table="<results>/{scene}/composition/{level}/train.csv",
+    log:
+        "<logs>/{scene}/train_level/{level}.log",
+    benchmark:
+        "<benchmarks>/{scene}/train_level/{level}.tsv"
+    conda:
+        "../envs/torch.yaml"
+    threads: workflow.cores
+    resources:
+        gpu=1,
+    params:
+        num_levels=len(LEVELS),
+        options=options("composition"),
+        version=fourd_config.stage_version("composition"),
+    shell:
+        "python -m fourd.composition train --level {wildcards.level}"
+        " --num-levels {params.num_levels} --views {input.views} --cameras {input.cameras}"
+        " --ingest {input.ingest} --foreground {input.foreground} --background {input.background}"
+        " {params.options} --threads {threads} --output-model {output.model}"
+        " --output-log {output.table} 2> >(tee {log} >&2)"

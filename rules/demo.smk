@@ -1,0 +1,81 @@
+"""The embedded event: frames, cameras and truth, made by seeded code."""
+
+# The scene file says how much of the event is filmed, the section `demo` how the event looks.
+DEMO_FLAGS = flags_from_mapping(
+    {
+        "num_cameras": len(SCENE.cameras),
+        "num_frames": SCENE.num_frames,
+        "fps": SCENE.fps,
+        "width": SCENE.size[0],
+        "height": SCENE.size[1],
+        **config["demo"],
+    }
+)
+
+
+rule demo_frames:
+    output:
+        directory("data/demo/frames/{demo_cam}"),
+    log:
+        "<logs>/demo/demo_frames/{demo_cam}.log",
+    benchmark:
+        "<benchmarks>/demo/demo_frames/{demo_cam}.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        options=DEMO_FLAGS,
+        version=fourd_config.stage_version("demo"),
+    shell:
+        "python -m fourd.demo camera --name {wildcards.demo_cam} --output {output} {params.options} 2> {log}"
+
+
+rule demo_cameras:
+    output:
+        "data/demo/cameras.json",
+    log:
+        "<logs>/demo/demo_cameras.log",
+    benchmark:
+        "<benchmarks>/demo/demo_cameras.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        options=DEMO_FLAGS,
+        version=fourd_config.stage_version("demo"),
+    shell:
+        "python -m fourd.demo cameras --output {output} {params.options} 2> {log}"
+
+
+rule demo_labels:
+    output:
+        directory("data/demo/truth/labels/{demo_cam}"),
+    log:
+        "<logs>/demo/demo_labels/{demo_cam}.log",
+    benchmark:
+        "<benchmarks>/demo/demo_labels/{demo_cam}.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        options=DEMO_FLAGS,
+        version=fourd_config.stage_version("demo"),
+    shell:
+        "python -m fourd.demo labels --name {wildcards.demo_cam} --output {output} {params.options} 2> {log}"
+
+
+rule demo_phone:
+    output:
+        "data/demo/phones/{demo_cam}.mp4",
+    log:
+        "<logs>/demo/demo_phone/{demo_cam}.log",
+    benchmark:
+        "<benchmarks>/demo/demo_phone/{demo_cam}.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        options=DEMO_FLAGS,
+        version=fourd_config.stage_version("demo"),
+    shell:
+        "python -m fourd.demo phones --name {wildcards.demo_cam} --output {output} {params.options} 2> {log}"

@@ -1,0 +1,65 @@
+"""Held-out cameras: what was rendered against what was filmed."""
+
+
+def evaluated(stage, suffix=""):
+    return lambda wildcards: [
+        f"<results>/{wildcards.scene}/{stage}/{wildcards.cam}/{chunk}{suffix}"
+        for chunk in chunks_of_view(wildcards.cam)
+    ]
+
+
+def labels_of(wildcards):
+    return [f"{SCENE.labels}/{wildcards.cam}"] if SCENE.labels else []
+
+
+rule evaluate_camera:
+    input:
+        view="<results>/{scene}/views/{cam}.json",
+        cameras="<results>/{scene}/sfm/cameras.json",
+        ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.cameras),
+        labels=labels_of,
+        rendered=evaluated("render"),
+        foreground=evaluated("foreground", ".npz"),
+        background=evaluated("background", ".npz"),
+    output:
+        table="<results>/{scene}/evaluate/{cam}.csv",
+        sheet="<results>/{scene}/evaluate/{cam}.png",
+    log:
+        "<logs>/{scene}/evaluate_camera/{cam}.log",
+    benchmark:
+        "<benchmarks>/{scene}/evaluate_camera/{cam}.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        labels=lambda wildcards, input: f"--labels {input.labels}" if input.labels else "",
+        options=options("evaluate"),
+        version=fourd_config.stage_version("evaluate"),
+    shell:
+        "python -m fourd.evaluate camera --view-file {input.view} --cameras {input.cameras}"
+        " --ingest {input.ingest} {params.labels} --rendered {input.rendered}"
+        " --foreground {input.foreground} --background {input.background} {params.options}"
+        " --output {output.table} --output-sheet {output.sheet} 2> {log}"
+
+
+rule collect_metrics:
+    input:
+        tables=expand("<results>/{{scene}}/evaluate/{cam}.csv", cam=SCENE.heldout),
+        sheets=expand("<results>/{{scene}}/evaluate/{cam}.png", cam=SCENE.heldout),
+    output:
+        metrics="<results>/{scene}/evaluate/metrics.csv",
+        table="<results>/{scene}/evaluate/table.md",
+        sheet="<results>/{scene}/evaluate/contact_sheet.png",
+    log:
+        "<logs>/{scene}/collect_metrics.log",
+    benchmark:
+        "<benchmarks>/{scene}/collect_metrics.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        version=fourd_config.stage_version("evaluate"),
+    shell:
+        "python -m fourd.evaluate collect --inputs {input.tables} --sheets {input.sheets}"
+        " --output {output.metrics} --output-table {output.table} --output-sheet {output.sheet}"
+        " 2> {log}"

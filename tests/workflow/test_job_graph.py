@@ -1,0 +1,82 @@
+"""What the dry run shows: how many jobs of each rule, and what a changed setting runs again."""
+
+import re
+import resource
+import subprocess
+
+import pytest
+
+from tests.conftest import Workspace, tiny_scene
+
+DRY_RUN = ("-n", "--quiet", "rules", "host")
+
+
+def job_counts(output: str) -> dict[str, int]:
+    """Rule -> number of jobs, from the table that a dry run prints."""
+    table = output.split("Job stats:")[1].split("total")[0]
+    return {rule: int(count) for rule, count in re.findall(r"^(\w+)\s+(\d+)$", table, re.MULTILINE)}
+
+
+def large_scene(workspace: Workspace, num_cameras: int, num_frames: int, heldout: int = 0) -> dict:
+    names = [f"cam{i:02d}" for i in range(num_cameras)]
+    for name in [*names, "cameras"]:
+        (workspace.folder / name).touch()
+    return {
+        "num_frames": num_frames,
+        "size": [1920, 1080],
+        "cameras": {name: {"source": name} for name in names},
+        "heldout": names[:heldout],
+        "calibration": ["cameras"],
+    }
+
+
+def test_demo_counts(workspace: Workspace) -> None:
+    workspace.write_scene("demo", tiny_scene(num_cameras=5, num_frames=6))
+    result = workspace.snakemake(*DRY_RUN, "render_all")
+    assert result.returncode == 0, result.stdout
+    counts = job_counts(result.stdout)
+    # 4 inputs and 1 held-out camera, 2 chunks, 3 trajectories of which one has a frozen clock.
+    assert counts["demo_frames"] == 5
+    assert counts["probe_camera"] == 5
+    assert counts["rectify_pair"] == 6
+    assert counts["disparity"] == 6 * (2 + 1)
+    assert counts["place_view"] == 5 + 3
+    assert counts["train_level"] == 1
+    assert counts["fuse_foreground"] == counts["estimate_background"]
+    assert counts["encode_film"] == 3
+    assert counts["evaluate_camera"] == 1
+
+
+def test_fifteen_cameras_nine_hundred_frames(workspace: Workspace) -> None:
+    """About two thousand jobs, and a dry run within five seconds of processor time."""
+    workspace.write_config({"scene": "large"})
+    workspace.write_scene("large", large_scene(workspace, 15, 900))
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    result = workspace.snakemake(*DRY_RUN, "render_all")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert result.returncode == 0, result.stdout
+    counts = job_counts(result.stdout)
+    assert counts["rectify_pair"] == 105
+    assert counts["disparity"] == 105 * (900 // 60 + 1)
+    assert counts["train_level"] == 3
+    assert 1_900 <= sum(counts.values()) <= 2_700
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    print(f"{sum(counts.values())} jobs, dry run {seconds:.1f} s of processor time")
+
+
+def test_too_many_jobs_are_refused_with_a_chunk_size_that_fits(workspace: Workspace) -> None:
+    workspace.write_config({"scene": "large", "chunk_frames": 1})
+    workspace.write_scene("large", large_scene(workspace, 15, 900))
+    result = workspace.snakemake(*DRY_RUN, "render_all")
+    assert result.returncode != 0
+    proposed = re.search(r"use chunk_frames (\d+) or more", " ".join(result.stdout.split()))
+    assert proposed, result.stdout
+    workspace.write_config({"scene": "large", "chunk_frames": int(proposed[1])})
+    assert workspace.snakemake(*DRY_RUN, "render_all").returncode == 0
+
+
+@pytest.mark.parametrize("arguments", [("--lint",), ("--rulegraph", "render_all")])
+def test_lint_and_rule_graph(workspace: Workspace, arguments: tuple[str, ...]) -> None:
+    workspace.write_scene("demo", tiny_scene())
+    result: subprocess.CompletedProcess[str] = workspace.snakemake(*arguments)
+    assert result.returncode == 0, result.stdout
