@@ -1,6 +1,23 @@
 """Probe each source: when every frame was taken, how large it is, whether it is what it was."""
 
 
+rule fetch_pose2sim:
+    output:
+        films=expand("data/pose2sim/cam{number:02d}.mp4", number=range(1, 5)),
+        calibration="data/pose2sim/cameras.json",
+    log:
+        "<logs>/fetch_pose2sim.log",
+    benchmark:
+        "<benchmarks>/fetch_pose2sim.tsv"
+    conda:
+        "../envs/vision.yaml"
+    localrule: True
+    params:
+        version=fourd_config.stage_version("fetch"),
+    shell:
+        "python -m fourd.fetch pose2sim --output data/pose2sim 2> {log}"
+
+
 rule probe_camera:
     input:
         source=lambda wildcards: SCENE.cameras[wildcards.cam].source,

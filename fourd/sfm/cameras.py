@@ -1,0 +1,77 @@
+"""The file sfm/cameras.json: cameras of a scene as every later stage reads them."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from fourd.camera import CameraTrack, tracks_from_dict, tracks_to_dict
+from fourd.errors import InputError
+from fourd.io import SCHEMA_VERSION, read_json, write_json
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SceneCameras:
+    """All cameras of a scene in the normalised world.
+
+    inputs, heldout: names in the scene's order;  tracks: name -> camera over time, both kinds
+    origin: (3,), scale: similarity to the calibration's world, source = world * scale + origin
+    up: (3,) unit vector, world direction that appears upward in the images
+    depth_range_from: name -> `given`, `calibration`, `sparse points` or `camera geometry`
+    """
+
+    fps: float
+    num_frames: int
+    inputs: tuple[str, ...]
+    heldout: tuple[str, ...]
+    tracks: Mapping[str, CameraTrack]
+    origin: np.ndarray
+    scale: float
+    up: np.ndarray
+    depth_range_from: Mapping[str, str]
+
+
+def write_cameras(path: Path | str, scene: SceneCameras) -> None:
+    """Write cameras.json (docs/formats.md)."""
+    entries = tracks_to_dict(scene.tracks)
+    for name, source in scene.depth_range_from.items():
+        entries[name]["depth_range_from"] = source
+    document = {
+        "fps": scene.fps,
+        "num_frames": scene.num_frames,
+        "world": {"scale": scene.scale, "origin": scene.origin.tolist()},
+        "up": scene.up.tolist(),
+        "inputs": list(scene.inputs),
+        "heldout": list(scene.heldout),
+        "cameras": entries,
+    }
+    write_json(path, document)
+
+
+def read_cameras(path: Path | str) -> SceneCameras:
+    """Read cameras.json; every camera is checked. Raises InputError, naming the file."""
+    document = read_json(path)
+    if document.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(
+            f"{path}: expected schema_version {SCHEMA_VERSION}, got {document.get('schema_version')}: "
+            "delete the file and run again"
+        )
+    try:
+        return SceneCameras(
+            fps=float(document["fps"]),
+            num_frames=int(document["num_frames"]),
+            inputs=tuple(document["inputs"]),
+            heldout=tuple(document["heldout"]),
+            tracks=tracks_from_dict(document["cameras"], str(path)),
+            origin=np.asarray(document["world"]["origin"], dtype=np.float64).reshape(3),
+            scale=float(document["world"]["scale"]),
+            up=np.asarray(document["up"], dtype=np.float64).reshape(3),
+            depth_range_from={n: e.get("depth_range_from", "given") for n, e in document["cameras"].items()},
+        )
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: expected cameras.json of this workflow, got {error!r}: delete it and run again"
+        ) from None
