@@ -16,6 +16,9 @@ from fourd.geometry import convergence_point, nearest_rotation
 # Axes whose directions spread less than this meet too far away to name a point.
 MIN_CONVERGENCE_DEG = 2.0
 
+# Weight of the mean image-up axis against level right-hand axes: a tie-break, not an opinion.
+MEAN_UP_WEIGHT = 1e-2
+
 # Centres closer together than this many roundings of their distance from the source's origin coincide.
 COINCIDENT_ROUNDINGS = 64
 
@@ -83,10 +86,17 @@ def sample_cameras(tracks: Mapping[str, Sequence[Camera]], num_samples: int = 9)
 
 
 def estimate_up(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) unit vector: mean of the cameras' image-up axes, in the world.
+    """(3,) unit vector that is upward in the world, as far as the cameras tell.
 
-    If they cancel (cameras upside down facing as many upright ones) the first camera's is taken.
+    People hold phones level, so the image's right-hand axes lie in the horizontal plane whether or
+    not the phones look down: up is the direction most perpendicular to them. The mean image-up axis
+    gives the sign, and the direction where the right-hand axes are all parallel. If the image-up
+    axes cancel (cameras upside down facing as many upright ones) the first camera's is taken.
     """
-    up = -np.stack([c.R[1] for c in cameras]).mean(axis=0)
-    length = np.linalg.norm(up)
-    return up / length if length > 1e-3 else -cameras[0].R[1]
+    mean_up = -np.stack([c.R[1] for c in cameras]).mean(axis=0)
+    length = np.linalg.norm(mean_up)
+    mean_up = mean_up / length if length > 1e-3 else -cameras[0].R[1]
+    right = np.stack([c.R[0] for c in cameras])
+    spread = right.T @ right / len(cameras) + MEAN_UP_WEIGHT * (np.eye(3) - np.outer(mean_up, mean_up))
+    up = np.linalg.eigh(spread)[1][:, 0]
+    return up * np.sign(up @ mean_up)

@@ -1,0 +1,58 @@
+"""`python -m fourd.evaluate camera` and `python -m fourd.evaluate collect`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from fourd import cli
+from fourd.evaluate import EvaluateOptions
+from fourd.evaluate.camera import Sources, run_camera
+from fourd.evaluate.table import run_collect
+
+
+def _named_path(word: str) -> tuple[str, Path]:
+    """`cam03=results/demo/ingest/cam03.json`, or the path alone, whose stem is then the name."""
+    name, separator, path = word.partition("=")
+    return (name, Path(path)) if separator else (Path(word).stem, Path(word))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line of the stage."""
+    parser = argparse.ArgumentParser(prog="python -m fourd.evaluate")
+    commands = parser.add_subparsers(dest="command", required=True)
+    camera = commands.add_parser("camera", help="score one held-out camera")
+    camera.add_argument("--view-file", type=Path, required=True)
+    camera.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
+    camera.add_argument("--ingest", type=_named_path, nargs="+", required=True, metavar="CAM=FILE")
+    camera.add_argument("--rendered", type=Path, nargs="+", required=True, help="folders of the stage render")
+    camera.add_argument("--foreground", type=Path, nargs="+", required=True)
+    camera.add_argument("--background", type=Path, nargs="+", required=True)
+    camera.add_argument("--labels", type=Path, help="folder of this camera's true masks")
+    cli.add_options(camera, EvaluateOptions)
+    collect = commands.add_parser("collect", help="join the scores of all held-out cameras")
+    collect.add_argument("--inputs", type=Path, nargs="+", required=True)
+    collect.add_argument("--sheets", type=Path, nargs="+", required=True)
+    collect.add_argument("--output-table", type=Path, required=True)
+    for command in (camera, collect):
+        command.add_argument("--output", type=Path, required=True)
+        command.add_argument("--output-sheet", type=Path, required=True)
+    args = parser.parse_args(argv)
+    if args.command == "collect":
+        print(run_collect(args.inputs, args.sheets, args.output, args.output_table, args.output_sheet))
+        return
+    sources = Sources(
+        args.view_file,
+        args.cameras,
+        dict(args.ingest),
+        tuple(args.rendered),
+        tuple(args.foreground),
+        tuple(args.background),
+        args.labels,
+    )
+    cli.set_num_threads(1)
+    run_camera(sources, args.output, args.output_sheet, cli.options_from_args(EvaluateOptions, args))
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run_stage(main))

@@ -1,0 +1,99 @@
+"""Where something moves in a held-out frame: from true masks, or from what no still picture explains."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fourd.camera import Camera
+from fourd.errors import InputError
+from fourd.evaluate import EvaluateOptions
+from fourd.image import undistort
+from fourd.io import read_image
+
+STRIP_ROWS = 64
+
+
+def read_dynamic_mask(folder: Path, frame: int, camera: Camera, target: Camera) -> np.ndarray:
+    """(h, w) bool from a true mask `000012.png`, 0 where nothing moves, as the target view sees it.
+
+    Raises InputError if the mask is missing or not of the camera's size.
+    """
+    path = folder / f"{frame:06d}.png"
+    labels = read_image(path)
+    if labels.shape[1::-1] != camera.size:
+        raise InputError(
+            f"expected a mask of the camera's {camera.size[0]} x {camera.size[1]} px at {path}, got "
+            f"{labels.shape[1]} x {labels.shape[0]}: give masks of the original size"
+        )
+    moves = np.repeat((labels > 0).any(axis=2, keepdims=True), 3, axis=2)
+    resampled, valid = undistort(moves.astype(np.uint8) * 255, camera, target)
+    return (resampled[..., 0] > 127) & valid
+
+
+class StillPicture:
+    """What a camera shows most of the time, from any of its poses: the median of frames of its own.
+
+    Frames are brought together by rotation alone, exact for a camera that turns where it stands;
+    what a few centimetres of shake displace is left to the tolerance of `find_dynamic_pixels`.
+    """
+
+    def __init__(self, frames: Sequence[tuple[np.ndarray, Camera]]) -> None:
+        self._camera = frames[len(frames) // 2][1].without_distortion()
+        turned = [undistort(image, _moved(camera, self._camera), self._camera) for image, camera in frames]
+        shape = turned[0][0].shape
+        self._rgb, self._valid = np.zeros(shape, np.uint8), np.zeros(shape[:2], bool)
+        # In strips, since the median needs all frames as float.
+        for top in range(0, shape[0], STRIP_ROWS):
+            rows = slice(top, top + STRIP_ROWS)
+            values = np.stack([np.where(ok[rows, :, None], rgb[rows], np.nan) for rgb, ok in turned])
+            self._valid[rows] = ~np.isnan(values[..., 0]).all(axis=0)
+            values[:, ~self._valid[rows]] = 0
+            self._rgb[rows] = np.floor(np.nanmedian(values, axis=0) + 0.5).astype(np.uint8)
+
+    def seen_from(self, target: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """(h, w, 3) uint8 and (h, w) bool as a view of this camera sees it."""
+        return undistort(self._rgb, _moved(self._camera, target), target)
+
+
+def _moved(camera: Camera, to: Camera) -> Camera:
+    """The camera with its own direction at another camera's centre."""
+    return dataclasses.replace(camera, t=-camera.R @ to.center)
+
+
+def find_dynamic_pixels(
+    truth: np.ndarray,
+    still_pictures: Sequence[tuple[np.ndarray, np.ndarray]],
+    options: EvaluateOptions,
+) -> np.ndarray:
+    """(H, W) bool: pixels of a true frame that no still picture explains, cleaned of specks.
+
+    truth: (H, W, 3) uint8;  still_pictures: one or more (H, W, 3) uint8 and where it is known,
+    (H, W) bool; a pixel that none knows is not dynamic
+    """
+    known = np.zeros(truth.shape[:2], bool)
+    explained = np.zeros_like(known)
+    for still, valid in still_pictures:
+        known |= valid
+        explained |= valid & (_distance_from_range(truth, still, valid, options) <= options.dynamic_threshold)
+    moves = (known & ~explained).astype(np.uint8)
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    moves = cv2.morphologyEx(moves, cv2.MORPH_CLOSE, disk)
+    moves = cv2.morphologyEx(moves, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(moves, connectivity=8)
+    keeps = stats[:, cv2.CC_STAT_AREA] >= options.dynamic_min_share * moves.size
+    keeps[0] = False
+    return keeps[np.asarray(labels, dtype=np.intp)]
+
+
+def _distance_from_range(
+    truth: np.ndarray, still: np.ndarray, valid: np.ndarray, options: EvaluateOptions
+) -> np.ndarray:
+    """(H, W) float32 grey levels, the largest over channels, outside the still picture's range nearby."""
+    window = np.ones((2 * options.dynamic_tolerance_px + 1,) * 2, np.uint8)
+    # Blanks are put outside the range of the others, so they explain nothing.
+    lowest = cv2.erode(np.where(valid[..., None], still, np.uint8(255)), window).astype(np.float32)
+    highest = cv2.dilate(np.where(valid[..., None], still, np.uint8(0)), window).astype(np.float32)
+    return np.maximum(lowest - truth, truth - highest).max(axis=2)

@@ -1,0 +1,245 @@
+"""Stage `render`: frames of a view through the trained generators, and a film of them.
+
+`frames` reads the estimates of one view and chunk and writes a folder of `000012.png` and
+`holes.csv`; `video` joins such folders into an MP4. Section 4.1 of the paper.
+"""
+
+import argparse
+import contextlib
+import dataclasses
+import logging
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from fourd import cli
+from fourd.composition import CascadeOptions
+from fourd.errors import InputError
+from fourd.io import Archive, read_image, write_csv, write_png
+from fourd.views import read_view
+
+STAGE_VERSION = 1
+HOLES_COLUMNS = ("frame", "level", "hole_share", "largest_hole_share", "filled_share", "reason")
+PROGRESS_INTERVAL_S = 2.0
+
+logger = logging.getLogger(__name__)
+ItemT = TypeVar("ItemT")
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderOptions(CascadeOptions):
+    """When coarser levels help a frame, as in `CascadeOptions`; a change renders again, trains nothing."""
+
+
+class BackgroundReader:
+    """Arrays of `background/{view}/{chunk}.npz` by output frame; frames that share a picture read it once."""
+
+    def __init__(self, archive: Archive, keys: Sequence[str]) -> None:
+        self._archive = archive
+        self._keys = tuple(keys)
+        self._same_as = {int(frame): int(kept) for frame, kept in archive.meta.get("same_as", {}).items()}
+        self._last: tuple[int, dict[str, np.ndarray]] | None = None
+
+    def frames(self) -> list[int]:
+        """Sorted output frames that can be read."""
+        return sorted({*self._archive.frames(), *self._same_as})
+
+    def read(self, frame: int) -> dict[str, np.ndarray]:
+        """The asked-for arrays of one frame. Raises InputError if the file has none."""
+        kept = self._same_as.get(frame, frame)
+        if self._last is None or self._last[0] != kept:
+            self._last = (kept, read_arrays(self._archive, kept, self._keys))
+        return self._last[1]
+
+
+def read_arrays(archive: Archive, frame: int, keys: Sequence[str]) -> dict[str, np.ndarray]:
+    """Some arrays of one frame, the others unread. Raises InputError if the archive lacks one."""
+    missing = [key for key in keys if f"{frame:06d}/{key}" not in archive]
+    if missing:
+        raise InputError(
+            f"expected {missing[0]} of frame {frame} in {archive.path}, found none: "
+            "delete the file and run again"
+        )
+    return {key: archive[f"{frame:06d}/{key}"] for key in keys}
+
+
+def with_progress(items: Sequence[ItemT], what: str) -> Iterator[ItemT]:
+    """The items, with a line about how many are done and how long the rest takes every few seconds."""
+    start = last = time.monotonic()
+    for i, item in enumerate(items):
+        yield item
+        now = time.monotonic()
+        if now - last >= PROGRESS_INTERVAL_S or i + 1 == len(items):
+            left_s = (now - start) / (i + 1) * (len(items) - i - 1)
+            logger.info("%s: %d of %d done, about %.0f s left", what, i + 1, len(items), left_s)
+            last = now
+
+
+@contextlib.contextmanager
+def atomic_directory(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`; it takes the place of `path` when the block succeeds."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    # One job writes a folder, so what lies here was left by a job that was killed.
+    if temporary.is_dir():
+        shutil.rmtree(temporary)
+    temporary.mkdir()
+    try:
+        yield temporary
+        if path.is_dir():
+            shutil.rmtree(path)
+        temporary.rename(path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def choose_device(name: str) -> str:
+    """`auto` is the first CUDA device that works, else the CPU. Raises InputError for one that does not."""
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError(
+            f"--device: expected a device of this machine, got {name}, but CUDA finds none: use cpu"
+        )
+    return name
+
+
+def run_frames(
+    view_path: Path,
+    model_paths: Sequence[Path],
+    foreground_path: Path,
+    background_path: Path,
+    frames: Sequence[int],
+    output: Path,
+    options: RenderOptions,
+    device: str = "auto",
+) -> None:
+    """Render output frames of a view into a folder, which appears when it is complete.
+
+    Raises InputError if a file is missing, broken, or is of another view or size.
+    """
+    # Torch takes seconds to import, and a film is encoded without it.
+    from fourd.composition.infer import compose_frame, load_models
+
+    view = read_view(view_path)
+    for frame in frames:
+        view.at(frame)
+    models = load_models(list(model_paths), choose_device(device))
+    with (
+        contextlib.closing(Archive(foreground_path)) as foreground,
+        contextlib.closing(Archive(background_path)) as background,
+    ):
+        _check_same_view(view.name, (foreground, background))
+        backgrounds = BackgroundReader(background, ("farthest_rgb", "farthest_valid"))
+        rows = []
+        with atomic_directory(output) as folder:
+            for frame in with_progress(frames, f"render {view.name}"):
+                consensus = read_arrays(foreground, frame, ("consensus_rgb", "consensus_valid"))
+                _check_size(view.size, consensus["consensus_rgb"], foreground_path)
+                image, levels = compose_frame(models, frame, consensus, backgrounds.read(frame), options)
+                write_png(folder / f"{frame:06d}.png", image)
+                rows.extend(levels)
+            write_csv(folder / "holes.csv", HOLES_COLUMNS, rows)
+
+
+def _check_same_view(name: str, archives: Sequence[Archive]) -> None:
+    for archive in archives:
+        given = archive.meta.get("view")
+        if given != name:
+            raise InputError(
+                f"expected the estimates of view {name} in {archive.path}, got {given}: check the paths"
+            )
+
+
+def _check_size(size: tuple[int, int], image: np.ndarray, path: Path) -> None:
+    if image.shape[1::-1] != size:
+        raise InputError(
+            f"expected pictures of {size[0]} x {size[1]} px in {path}, got {image.shape[1]} x "
+            f"{image.shape[0]}: fuse this view again"
+        )
+
+
+def list_frames(folders: Sequence[Path]) -> dict[int, Path]:
+    """PNG files of rendered folders by output frame, rising.
+
+    Raises InputError for a folder that is missing or a frame that two folders hold.
+    """
+    found: dict[int, Path] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"expected a folder of rendered frames at {folder}, found none: render it first")
+        for path in folder.glob("[0-9]*.png"):
+            if int(path.stem) in found:
+                raise InputError(
+                    f"expected frame {int(path.stem)} once, got {found[int(path.stem)]} and {path}: fix it"
+                )
+            found[int(path.stem)] = path
+    return dict(sorted(found.items()))
+
+
+def run_video(folders: Sequence[Path], fps: float, output: Path) -> None:
+    """Encode the frames of all folders, which must follow on each other without a gap.
+
+    Raises InputError if there is none, or one is missing between the first and the last.
+    """
+    from fourd.video import encode_video
+
+    found = list_frames(folders)
+    if not found:
+        raise InputError(
+            f"expected rendered frames in {', '.join(map(str, folders))}, found none: render first"
+        )
+    missing = sorted(set(range(min(found), max(found) + 1)) - set(found))
+    if missing:
+        raise InputError(
+            f"expected every frame from {min(found)} to {max(found)}, but frame {missing[0]} is missing in "
+            f"{', '.join(map(str, folders))}: render it first"
+        )
+    encode_video(output, (read_image(path) for path in with_progress(list(found.values()), output.name)), fps)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line of the stage."""
+    parser = argparse.ArgumentParser(prog="python -m fourd.render", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    frames = commands.add_parser("frames", help="render frames of one view")
+    frames.add_argument("--view-file", type=Path, required=True)
+    frames.add_argument("--models", type=Path, nargs="+", required=True, help="model.pt of every level")
+    frames.add_argument("--foreground", type=Path, required=True)
+    frames.add_argument("--background", type=Path, required=True)
+    frames.add_argument("--frames", type=int, nargs="+", required=True, help="output frames")
+    frames.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ...")
+    frames.add_argument("--threads", type=int, default=1)
+    video = commands.add_parser("video", help="join rendered frames into an MP4")
+    video.add_argument("--frames-dir", type=Path, nargs="+", required=True)
+    video.add_argument("--fps", type=float, required=True)
+    for command in (frames, video):
+        cli.add_options(command, RenderOptions)
+        command.add_argument("--output", type=Path, required=True)
+    args = parser.parse_args(argv)
+    if args.command == "video":
+        run_video(args.frames_dir, args.fps, args.output)
+        return
+    cli.set_num_threads(args.threads)
+    options = cli.options_from_args(RenderOptions, args)
+    run_frames(
+        args.view_file,
+        args.models,
+        args.foreground,
+        args.background,
+        args.frames,
+        args.output,
+        options,
+        args.device,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run_stage(main))

@@ -1,0 +1,352 @@
+import csv
+import dataclasses
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from fourd import cli, ingest, io, metrics, views
+from fourd.baselines import METHODS, Evidence, nn_same_time
+from fourd.camera import Camera, CameraTrack
+from fourd.errors import InputError
+from fourd.evaluate import EvaluateOptions, contact_sheet, regions, table
+from fourd.evaluate.__main__ import main
+from fourd.evaluate.camera import COLUMNS, score_image
+from fourd.geometry import look_at
+from fourd.image import undistort
+from fourd.sfm import SceneCameras, write_cameras
+
+SIZE = (96, 64)
+SCHEMA = Path(__file__).resolve().parents[2] / "config" / "schemas" / "evaluate.schema.yaml"
+NAMES = ("cam00", "cam01", "cam02", "cam03")
+HELDOUT = "cam01"
+
+
+def texture(seed: int, size=SIZE) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 2.5)
+
+
+def filmed(name: str, frame: int) -> np.ndarray:
+    """A still place with a bright square that moves; cameras 1 and 2 see the place alike."""
+    image = texture({"cam00": 1, "cam01": 2, "cam02": 2, "cam03": 3}[name]).copy()
+    image[20:36, 10 + 20 * frame : 26 + 20 * frame] = (250, 250, 240)
+    return image
+
+
+def make_scene(folder: Path) -> None:
+    tracks = {}
+    for i, name in enumerate(NAMES):
+        angle = np.radians(-30 + 20 * i)
+        R, t = look_at(
+            np.array([5 * np.cos(angle), 5 * np.sin(angle), 1.5]), np.zeros(3), np.array([0, 0, 1.0])
+        )
+        K = np.array([[90.0, 0, 47.5], [0, 90, 31.5], [0, 0, 1]])
+        tracks[name] = CameraTrack(name, (Camera(K, R, t, SIZE),), 1.0, 9.0)
+        for frame in range(3):
+            io.write_png(folder / "source" / name / f"{frame:06d}.png", filmed(name, frame))
+        ingest.run(
+            name, folder / "source" / name, 30.0, 3, 0.0, folder / f"{name}.json", ingest.IngestOptions()
+        )
+    inputs = tuple(n for n in NAMES if n != HELDOUT)
+    scene = SceneCameras(
+        30.0,
+        3,
+        inputs,
+        (HELDOUT,),
+        tracks,
+        np.zeros(3),
+        1.0,
+        np.array([0, 0, 1.0]),
+        dict.fromkeys(NAMES, "given"),
+    )
+    write_cameras(folder / "cameras.json", scene)
+    for name in NAMES:
+        view = views.physical_view(scene, name, [0, 1, 2], None)
+        views.write_view(folder / "views" / f"{name}.json", view)
+
+
+def make_estimates(folder: Path) -> None:
+    """Perfect background, foreground of the square's surroundings, and renders off by 3 levels."""
+    with io.ArchiveWriter(folder / "foreground.npz", {"view": HELDOUT}) as writer:
+        for frame in range(3):
+            near = np.zeros((64, 96), bool)
+            near[16:40, 8:72] = True
+            image = filmed(HELDOUT, frame) * near[..., None].astype(np.uint8)
+            writer.add_frame(frame, consensus_rgb=image, consensus_valid=near)
+    with io.ArchiveWriter(
+        folder / "background.npz", {"view": HELDOUT, "same_as": {"1": 0, "2": 0}}
+    ) as writer:
+        place = texture(2)
+        seen = np.ones((64, 96), bool)
+        seen[:8] = False
+        writer.add_frame(0, farthest_rgb=place, farthest_valid=seen)
+    for frame in range(3):
+        rendered = np.clip(filmed(HELDOUT, frame).astype(int) - 3, 0, 255).astype(np.uint8)
+        io.write_png(folder / "rendered" / f"{frame:06d}.png", rendered)
+
+
+def make_labels(folder: Path) -> Path:
+    for frame in range(3):
+        labels = np.zeros((64, 96), np.uint8)
+        labels[20:36, 10 + 20 * frame : 26 + 20 * frame] = 2
+        io.write_png(folder / "labels" / f"{frame:06d}.png", labels)
+    return folder / "labels"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("evaluate")
+    make_scene(folder)
+    make_estimates(folder)
+    make_labels(folder)
+    return folder
+
+
+def camera_command(folder: Path, output: Path, **changes) -> list[str]:
+    files = {
+        "view-file": folder / "views" / f"{HELDOUT}.json",
+        "cameras": folder / "cameras.json",
+        "rendered": folder / "rendered",
+        "foreground": folder / "foreground.npz",
+        "background": folder / "background.npz",
+        "labels": folder / "labels",
+        **{key.replace("_", "-"): value for key, value in changes.items()},
+    }
+    command = ["camera", "--ingest", *(f"{name}={folder / name}.json" for name in NAMES)]
+    for key, value in files.items():
+        command += [] if value is None else [f"--{key}", str(value)]
+    return [*command, "--output", str(output / "cam01.csv"), "--output-sheet", str(output / "cam01.png")]
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def value_of(rows, method, region, metric, frame) -> float:
+    wanted = {"method": method, "region": region, "metric": metric, "frame": str(frame)}
+    (row,) = (r for r in rows if all(r[k] == v for k, v in wanted.items()))
+    return float(row["value"])
+
+
+def test_schema_and_options_agree():
+    properties = yaml.safe_load(SCHEMA.read_text())["properties"]
+    expected = {field.name: field.default for field in dataclasses.fields(EvaluateOptions)}
+    assert {key: entry["default"] for key, entry in properties.items()} == expected
+
+
+def test_one_camera_is_scored_by_every_method(scene, tmp_path):
+    main(camera_command(scene, tmp_path))
+    rows = read_rows(tmp_path / "cam01.csv")
+    assert tuple(rows[0]) == COLUMNS
+    assert len(rows) == 3 * len(METHODS) * 2 * 3
+    assert {row["region_source"] for row in rows} == {"truth"}
+    assert {row["view"] for row in rows} == {"cam01"}
+    for frame in range(3):
+        truth = filmed(HELDOUT, frame)
+        assert value_of(rows, "ours", "full", "mse", frame) == 9
+        assert value_of(rows, "ours", "full", "psnr_db", frame) == pytest.approx(20 * math.log10(255 / 3))
+        assert value_of(rows, "background", "dynamic", "mse", frame) > 3000
+        assert value_of(rows, "paste", "dynamic", "psnr_db", frame) == math.inf
+        # The camera that sees the same place, with the square at the same spot, is the neighbour.
+        assert value_of(rows, "nn_same_time", "full", "psnr_db", frame) == math.inf
+        near = np.zeros((64, 96, 1), np.uint8)
+        near[16:40, 8:72] = 1
+        assert value_of(rows, "inst", "full", "mse", frame) == pytest.approx(metrics.mse(truth * near, truth))
+    counts = {row["num_pixels"] for row in rows if row["region"] == "dynamic"}
+    assert counts == {str(16 * 16)}
+
+
+def test_dynamic_region_without_labels_is_the_workflows_own(scene, tmp_path):
+    main(camera_command(scene, tmp_path, labels=None))
+    rows = read_rows(tmp_path / "cam01.csv")
+    assert {row["region_source"] for row in rows} == {"pipeline"}
+    counts = [int(r["num_pixels"]) for r in rows if r["region"] == "dynamic" and r["metric"] == "mse"]
+    assert all(200 <= count <= 256 for count in counts)
+
+
+def test_contact_sheet_shows_all_columns(scene, tmp_path):
+    main([*camera_command(scene, tmp_path), "--sheet-tile-px", "96", "--sheet-frames", "2"])
+    sheet = io.read_image(tmp_path / "cam01.png")
+    columns = len(contact_sheet.COLUMNS)
+    height = contact_sheet.HEADER_PX + 2 * (64 + contact_sheet.CAPTION_PX) + 4 * contact_sheet.GAP_PX
+    assert sheet.shape == (height, columns * 96 + (columns - 1) * contact_sheet.GAP_PX, 3)
+    top = contact_sheet.HEADER_PX + contact_sheet.GAP_PX
+    assert (sheet[top : top + 64, :96] == filmed(HELDOUT, 0)).all()
+    ours = sheet[top : top + 64, 4 * 98 : 4 * 98 + 96]
+    error = sheet[top : top + 64, 5 * 98 : 5 * 98 + 96]
+    assert (np.abs(ours.astype(int) - filmed(HELDOUT, 0)) * 4 == error).all()
+
+
+def test_collect_joins_cameras_into_table_and_sheet(scene, tmp_path, capsys):
+    main(camera_command(scene, tmp_path))
+    rows = read_rows(tmp_path / "cam01.csv")
+    other = [{**row, "view": "cam07"} for row in rows]
+    io.write_csv(tmp_path / "cam07.csv", COLUMNS, other)
+    main(
+        ["collect", "--inputs", str(tmp_path / "cam01.csv"), str(tmp_path / "cam07.csv")]
+        + ["--sheets", str(tmp_path / "cam01.png"), str(tmp_path / "cam01.png")]
+        + ["--output", str(tmp_path / "metrics.csv"), "--output-table", str(tmp_path / "table.md")]
+        + ["--output-sheet", str(tmp_path / "sheet.png")]
+    )
+    assert read_rows(tmp_path / "metrics.csv") == rows + other
+    text = (tmp_path / "table.md").read_text()
+    assert text in capsys.readouterr().out
+    assert "Full frame: mean and standard deviation over 6 frames of cam01, cam07" in text
+    assert "Dynamic region (true masks)" in text
+    assert "| ours | 9.0 +- 0.0 | 38.59 +- 0.00 |" in text
+    assert "| method | cam01 | cam07 |" in text
+    assert "nan" not in text
+    single, joined = io.read_image(tmp_path / "cam01.png"), io.read_image(tmp_path / "sheet.png")
+    assert joined.shape[0] > 2 * single.shape[0] and joined.shape[1] == single.shape[1]
+
+
+def test_summary_is_mean_and_sample_deviation():
+    assert table.summarize([1.0, 2.0, 6.0]) == pytest.approx((3.0, math.sqrt(7)))
+    assert table.summarize([4.0]) == (4.0, 0.0)
+    mean, deviation = table.summarize([1.0, math.inf])
+    assert mean == math.inf and math.isnan(deviation)
+
+
+def test_empty_region_is_written_as_nothing_not_as_nan(scene, tmp_path):
+    for frame in range(3):
+        io.write_png(tmp_path / "still" / f"{frame:06d}.png", np.zeros((64, 96), np.uint8))
+    main(camera_command(scene, tmp_path, labels=tmp_path / "still"))
+    dynamic = [row for row in read_rows(tmp_path / "cam01.csv") if row["region"] == "dynamic"]
+    assert {(row["value"], row["num_pixels"]) for row in dynamic} == {("", "0")}
+    assert "| ours | - | - | - |" in table.draw_table(read_rows(tmp_path / "cam01.csv"))
+
+
+def test_scores_equal_the_metrics():
+    truth, image = texture(0), texture(5)
+    region = np.zeros((64, 96), bool)
+    region[10:40, 30:70] = True
+    everything = np.ones_like(region)
+    scores = {
+        (name, metric): value
+        for name, metric, value, _ in score_image(image, truth, {"f": everything, "d": region})
+    }
+    for metric, function in (("mse", metrics.mse), ("psnr_db", metrics.psnr), ("ssim", metrics.ssim)):
+        assert scores["f", metric] == pytest.approx(function(image, truth), rel=1e-12)
+        assert scores["d", metric] == pytest.approx(function(image, truth, region), rel=1e-12)
+
+
+def test_dynamic_pixels_ignore_small_shifts_and_blanks():
+    place = texture(2)
+    valid = np.ones((64, 96), bool)
+    valid[:, 80:] = False
+    shifted = np.roll(place, 2, axis=1)
+    options = EvaluateOptions()
+    assert not regions.find_dynamic_pixels(shifted, [(place, valid)], options)[:, 4:].any()
+    moved = place.copy()
+    moved[20:40, 30:50] = 255 - moved[20:40, 30:50] // 4
+    moved[:, 80:] = 255
+    found = regions.find_dynamic_pixels(moved, [(place, valid)], options)
+    truth = np.zeros_like(found)
+    truth[20:40, 30:50] = True
+    assert (found & truth).sum() / (found | truth).sum() > 0.8
+    assert not found[:, 81:].any()
+
+
+def test_either_still_picture_explains_a_pixel():
+    place, torn = texture(2), texture(2)
+    torn[40:60, 60:90] = 0
+    valid = np.ones((64, 96), bool)
+    moved = place.copy()
+    moved[10:30, 10:40] = 255
+    options = EvaluateOptions()
+    assert regions.find_dynamic_pixels(moved, [(torn, valid)], options)[40:60, 60:90].mean() > 0.5
+    found = regions.find_dynamic_pixels(moved, [(torn, valid), (place, valid)], options)
+    assert not found[40:60, 60:90].any() and found[12:28, 12:38].all()
+    unknown = [(place, np.zeros_like(valid))]
+    assert not regions.find_dynamic_pixels(moved, unknown, options).any()
+
+
+def test_still_picture_leaves_out_movers_and_follows_the_rotation():
+    K = np.array([[90.0, 0, 47.5], [0, 90, 31.5], [0, 0, 1]])
+    wide = Camera(np.array([[90.0, 0, 79.5], [0, 90, 55.5], [0, 0, 1]]), np.eye(3), np.zeros(3), (160, 112))
+    place = texture(4, (160, 112))
+    frames, cameras = [], []
+    for i, angle in enumerate(np.radians([-4, -2, 0, 2, 4])):
+        R = cv2.Rodrigues(np.array([angle / 2, angle, 0]))[0]
+        camera = Camera(K, R, -R @ np.array([0.01 * i, 0, 0]), SIZE)
+        image, valid = undistort(place, dataclasses.replace(wide, t=-camera.center), camera)
+        assert valid.all()
+        image[20:36, 10 + 16 * i : 26 + 16 * i] = 255
+        frames.append((image, camera))
+        cameras.append(camera)
+    rgb, valid = regions.StillPicture(frames).seen_from(cameras[0])
+    truth, _ = undistort(place, dataclasses.replace(wide, t=-cameras[0].center), cameras[0])
+    inner = np.zeros_like(valid)
+    inner[4:-4, 4:-4] = True
+    assert valid.mean() > 0.8
+    assert metrics.psnr(rgb, truth, valid & inner) > 35
+
+
+def test_neighbour_feature_prefers_the_same_structure():
+    query = texture(2)
+    brighter = np.clip(query.astype(int) + 40, 0, 255).astype(np.uint8)
+    evidence = Evidence({}, {}, query, {"cam00": texture(1), "cam02": brighter, "cam03": texture(3)}, query)
+    assert nn_same_time.render(evidence) is brighter
+    assert np.linalg.norm(nn_same_time.describe_image(query)) == pytest.approx(1)
+    assert not nn_same_time.describe_image(np.full((64, 96, 3), 9, np.uint8)).any()
+
+
+def test_blanks_are_black_for_inst_and_mean_coloured_for_paste():
+    colour = np.full((4, 4, 3), 100, np.uint8)
+    near, far = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    near[0], far[1] = True, True
+    evidence = Evidence(
+        {"consensus_rgb": colour, "consensus_valid": near},
+        {"farthest_rgb": colour + 50, "farthest_valid": far},
+        colour,
+        {},
+        colour,
+    )
+    assert [METHODS["inst"](evidence)[row, 0, 0] for row in range(4)] == [100, 0, 0, 0]
+    assert [METHODS["background"](evidence)[row, 0, 0] for row in range(4)] == [0, 150, 0, 0]
+    assert [METHODS["paste"](evidence)[row, 0, 0] for row in range(4)] == [100, 150, 125, 125]
+
+
+def test_input_camera_is_no_evidence(scene, tmp_path, capsys):
+    changes = {"view_file": scene / "views" / "cam02.json"}
+    assert cli.run_stage(main, camera_command(scene, tmp_path, **changes)) == 2
+    assert "proves nothing" in capsys.readouterr().err
+
+
+def test_missing_files_are_named(scene, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="expected frame 0 in the files of --rendered"):
+        main(camera_command(scene, tmp_path, rendered=tmp_path / "empty"))
+    with pytest.raises(InputError, match="000000.png"):
+        main(camera_command(scene, tmp_path, labels=tmp_path / "empty"))
+    command = [word for word in camera_command(scene, tmp_path) if not word.startswith("cam03=")]
+    with pytest.raises(InputError, match="expected camera cam03 in --ingest"):
+        main(command)
+    with pytest.raises(InputError, match="expected the scores of a camera"):
+        table.read_metrics(tmp_path / "none.csv")
+    io.write_csv(tmp_path / "other.csv", ["a"], [{"a": 1}])
+    with pytest.raises(InputError, match="expected rows with view"):
+        table.read_metrics(tmp_path / "other.csv")
+
+
+def test_results_of_another_size_are_refused(scene, tmp_path):
+    for frame in range(3):
+        io.write_png(tmp_path / "small" / f"{frame:06d}.png", np.zeros((32, 48, 3), np.uint8))
+    with pytest.raises(InputError, match=r"expected pictures of \(96, 64\) px, got \(48, 32\)"):
+        main(camera_command(scene, tmp_path, rendered=tmp_path / "small"))
+
+
+def test_a_held_out_camera_makes_no_render():
+    stages = Path(cli.__file__).parent
+    makers = [
+        p for p in stages.rglob("*.py") if p.relative_to(stages).parts[0] not in ("evaluate", "baselines")
+    ]
+    importing = [
+        p.name for p in makers if "fourd.evaluate" in p.read_text() or "fourd.baselines" in p.read_text()
+    ]
+    assert importing == []
