@@ -1,0 +1,134 @@
+"""Error against time of the matcher's settings, on rectified pairs with true disparity.
+
+    python -m benches.stereo --data DIR --output DIR
+
+Every folder below DATA that holds view1.png, view5.png and disp1.png, or im2.png, im6.png and
+disp2.png, is a pair; disp is an 8-bit image of disparity times 3 or 4 (Middlebury 2003, 2005).
+Writes stereo.csv: one row per setting, means over the pairs.
+"""
+
+import argparse
+import dataclasses
+import math
+import resource
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fourd import io
+from fourd.camera import Camera
+from fourd.stereo.disparity import StereoOptions, make_matcher, match_pair
+from fourd.stereo.rectify import Rectification
+
+LAYOUTS = (("view1.png", "view5.png", "disp1.png", 3), ("im2.png", "im6.png", "disp2.png", 4))
+SETTINGS = {
+    "default": {},
+    "hh4": {"sgbm_mode": "hh4"},
+    "hh": {"sgbm_mode": "hh"},
+    "sgbm": {"sgbm_mode": "sgbm"},
+    "block3": {"sgbm_block_size_px": 3, "sgbm_penalty_small": 4, "sgbm_penalty_large": 32},
+    "block5": {"sgbm_block_size_px": 5, "sgbm_penalty_small": 4, "sgbm_penalty_large": 32},
+    "smooth": {"sgbm_penalty_small": 8, "sgbm_penalty_large": 96},
+    "rough": {"sgbm_penalty_small": 4, "sgbm_penalty_large": 16},
+    "unique10": {"sgbm_uniqueness_percent": 10},
+    "left_right_1px": {"max_left_right_px": 1.0},
+    "support_11px_50": {"support_px": 11, "min_support": 0.5},
+}
+COLUMNS = (
+    "setting",
+    "error",
+    "bad_2px",
+    "bad_1px",
+    "median_px",
+    "density",
+    "sigma_ratio",
+    "seconds",
+    "cpu_seconds",
+    "peak_rss_mb",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    left: np.ndarray
+    right: np.ndarray
+    truth: np.ndarray
+
+
+def find_pairs(data: Path) -> Iterator[Pair]:
+    """Pairs with truth (H, W) float32 px, NaN where unknown."""
+    for left, right, disparity, scale in LAYOUTS:
+        for path in sorted(data.rglob(disparity)):
+            raw = io.read_image(path)[:, :, 0].astype(np.float32)
+            truth = np.where(raw > 0, raw / scale, np.nan).astype(np.float32)
+            yield Pair(io.read_image(path.parent / left), io.read_image(path.parent / right), truth)
+
+
+def rectification_of(pair: Pair) -> tuple[Rectification, Camera]:
+    """The pair as it is: unit baseline, any focal length, and the camera of its images."""
+    height, width = pair.truth.shape
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+    size = (width, height)
+    top = float(np.nanmax(pair.truth)) + 2
+    rectification = Rectification(K, K, np.eye(3), np.zeros(3), np.array([1.0, 0, 0]), size, (0.0, top))
+    return rectification, Camera(K, np.eye(3), np.zeros(3), size)
+
+
+def measure(pairs: Sequence[Pair], options: StereoOptions) -> dict[str, float]:
+    matcher = make_matcher(options)
+    rows = []
+    start, cpu_start = time.perf_counter(), time.process_time()
+    results = [match_pair(*_arguments(pair), (pair.left, pair.right), matcher, options) for pair in pairs]
+    seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
+    for pair, result in zip(pairs, results, strict=True):
+        known = np.isfinite(pair.truth)
+        both = known & np.isfinite(result.left_disparity)
+        error = np.abs(result.left_disparity - pair.truth)[both]
+        predicted = result.sigma_px / result.left_confidence[both]
+        inlier = error < 3
+        rows.append(
+            {
+                "bad_2px": np.mean(error > 2),
+                "bad_1px": np.mean(error > 1),
+                "median_px": np.median(error),
+                "density": both.sum() / known.sum(),
+                "sigma_ratio": math.sqrt(np.mean((error / predicted)[inlier] ** 2)),
+            }
+        )
+    means = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+    return means | {
+        "error": means["bad_2px"],
+        "seconds": seconds / len(pairs),
+        "cpu_seconds": cpu_seconds / len(pairs),
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+
+
+def _arguments(pair: Pair) -> tuple[Rectification, tuple[Camera, Camera]]:
+    rectification, camera = rectification_of(pair)
+    return rectification, (camera, camera)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--output", type=Path, required=True)
+    args = parser.parse_args(argv)
+    cv2.setNumThreads(1)
+    pairs = list(find_pairs(args.data))
+    if not pairs:
+        raise SystemExit(
+            f"error: no rectified pairs with truth below {args.data}: see the head of benches/stereo.py"
+        )
+    rows = []
+    for name, changes in SETTINGS.items():
+        rows.append({"setting": name} | measure(pairs, dataclasses.replace(StereoOptions(), **changes)))
+        print("  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{v:16s}" for k, v in rows[-1].items()))
+    io.write_csv(args.output / "stereo.csv", COLUMNS, rows)
+
+
+if __name__ == "__main__":
+    main()

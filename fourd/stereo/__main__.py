@@ -1,0 +1,144 @@
+"""Command line of stage stereo: `rectify` a pair, then `disparity` of its frames."""
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fourd import cli, io
+from fourd.camera import CameraTrack, tracks_from_dict
+from fourd.errors import InputError
+from fourd.ingest import open_camera
+from fourd.stereo.disparity import StereoOptions, make_matcher, match_pair
+from fourd.stereo.files import (
+    add_disparity_frame,
+    disparity_meta,
+    read_rectification,
+    write_rectification,
+)
+from fourd.stereo.rectify import STATUS_OK, RectifyOptions, rectify_tracks
+
+_log = logging.getLogger(__name__)
+
+
+def read_tracks(cameras_path: Path, left: str, right: str) -> tuple[CameraTrack, CameraTrack]:
+    """Two cameras of a cameras file. Raises InputError if one is not in there."""
+    cameras = io.read_json(cameras_path).get("cameras", {})
+    for name in (left, right):
+        if name not in cameras:
+            raise InputError(
+                f"expected camera {name} in {cameras_path}, got {', '.join(cameras) or 'no cameras'}: "
+                "calibrate it or leave it out of the scene"
+            )
+    tracks = tracks_from_dict({name: cameras[name] for name in (left, right)}, str(cameras_path))
+    return tracks[left], tracks[right]
+
+
+def run_rectify(cameras_path: Path, left: str, right: str, options: RectifyOptions, output: Path) -> None:
+    """Rectify a pair, or refuse it, and write the result."""
+    pair = rectify_tracks(*read_tracks(cameras_path, left, right), options)
+    write_rectification(output, pair)
+    if pair.status == STATUS_OK:
+        low, high = np.array([r.disparity_range for r in pair.frames]).T
+        _log.info(
+            "%s-%s: %.1f degrees, %dx%d px, disparities %.0f to %.0f px",
+            left, right, pair.angle_deg, *pair.size, low.min(), high.max(),
+        )  # fmt: skip
+    else:
+        _log.info("%s-%s refused: %s", left, right, pair.status)
+
+
+def run_disparity(
+    rectification_path: Path,
+    ingest_paths: tuple[Path, Path],
+    cameras_path: Path,
+    frames: Sequence[int],
+    options: StereoOptions,
+    output: Path,
+) -> None:
+    """Match the frames of a pair and write them one by one; a refused pair keeps its reason."""
+    matcher = make_matcher(options)
+    pair = read_rectification(rectification_path)
+    with io.ArchiveWriter(output, disparity_meta(pair, options.sigma_px)) as writer:
+        if pair.status != STATUS_OK:
+            _log.info("%s-%s not matched: %s", pair.left, pair.right, pair.status)
+            return
+        tracks = read_tracks(cameras_path, pair.left, pair.right)
+        density = []
+        with open_camera(ingest_paths[0]) as left, open_camera(ingest_paths[1]) as right:
+            for frame in frames:
+                disparity = match_pair(
+                    pair.at(frame),
+                    (tracks[0].at(frame), tracks[1].at(frame)),
+                    (left.read(frame), right.read(frame)),
+                    matcher,
+                    options,
+                )
+                add_disparity_frame(writer, frame, disparity)
+                density.append(
+                    (
+                        np.isfinite(disparity.left_disparity).mean()
+                        + np.isfinite(disparity.right_disparity).mean()
+                    )
+                    / 2
+                )
+        _log.info(
+            "%s-%s frames %d to %d: %.0f %% of the rectified pixels matched",
+            pair.left, pair.right, frames[0], frames[-1], 100 * np.mean(density),
+        )  # fmt: skip
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse the command line and run one of the two commands."""
+    parser = argparse.ArgumentParser(prog="fourd.stereo", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    rectify = commands.add_parser("rectify", help="rectify a pair of cameras, or say why not")
+    rectify.add_argument("--cameras", type=Path, required=True)
+    rectify.add_argument("--left", required=True, help="name of a camera")
+    rectify.add_argument("--right", required=True, help="name of a camera")
+    cli.add_options(rectify, RectifyOptions)
+    match = commands.add_parser("disparity", help="match frames of a rectified pair in both directions")
+    match.add_argument("--rectification", type=Path, required=True)
+    match.add_argument("--left-ingest", type=Path, required=True)
+    match.add_argument("--right-ingest", type=Path, required=True)
+    match.add_argument("--cameras", type=Path, required=True)
+    match.add_argument("--frames", type=int, nargs="+", help="frames of the scene's clock")
+    match.add_argument("--first", type=int, help="first frame, instead of --frames")
+    match.add_argument("--last", type=int, help="last frame, inclusive")
+    match.add_argument("--threads", type=int, default=1)
+    cli.add_options(match, StereoOptions)
+    for command in (rectify, match):
+        command.add_argument("--output", type=Path, required=True)
+    args = parser.parse_args(argv)
+    if args.command == "rectify":
+        cli.set_num_threads(1)
+        options = cli.options_from_args(RectifyOptions, args)
+        run_rectify(args.cameras, args.left, args.right, options, args.output)
+        return
+    cli.set_num_threads(args.threads)
+    run_disparity(
+        args.rectification,
+        (args.left_ingest, args.right_ingest),
+        args.cameras,
+        _frames_from_args(args),
+        cli.options_from_args(StereoOptions, args),
+        args.output,
+    )
+
+
+def _frames_from_args(args: argparse.Namespace) -> list[int]:
+    if args.frames and args.first is None and args.last is None:
+        return args.frames
+    if not args.frames and args.first is not None and args.last is not None and args.first <= args.last:
+        return list(range(args.first, args.last + 1))
+    raise InputError(
+        "expected either --frames N ... or --first N --last M with N <= M, got "
+        f"frames {args.frames}, first {args.first}, last {args.last}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run_stage(main))

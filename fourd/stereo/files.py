@@ -1,0 +1,126 @@
+"""Files of stage stereo (docs/formats.md): rectification of a pair, disparity of a pair and chunk."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fourd.errors import InputError
+from fourd.io import Archive, ArchiveWriter
+from fourd.stereo.disparity import PairDisparity
+from fourd.stereo.rectify import STATUS_OK, PairRectification, Rectification
+
+DISPARITY_UNITS_PER_PX = 32
+INVALID_DISPARITY = -32768
+
+
+def write_rectification(path: Path | str, pair: PairRectification) -> None:
+    """Write `rectification/{pair}.npz`; a refused pair is a file with its reason and no frames."""
+    meta = {
+        "left": pair.left,
+        "right": pair.right,
+        "status": pair.status,
+        "size": list(pair.size),
+        "angle_deg": pair.angle_deg if np.isfinite(pair.angle_deg) else None,
+        "frames": pair.num_frames,
+    }
+    with ArchiveWriter(path, meta) as writer:
+        for frame, rectification in enumerate(pair.frames):
+            writer.add_frame(frame, **rectification.to_arrays())
+
+
+def read_rectification(path: Path | str) -> PairRectification:
+    """Inverse of `write_rectification`. Raises InputError if the file is not one."""
+    archive = Archive(path)
+    meta = archive.meta
+    try:
+        width, height = meta["size"]
+        frames = tuple(
+            Rectification.from_arrays(archive.frame(frame), (width, height)) for frame in archive.frames()
+        )
+        angle_deg = float("nan") if meta["angle_deg"] is None else float(meta["angle_deg"])
+        pair = PairRectification(
+            meta["left"], meta["right"], meta["status"], (width, height), angle_deg, meta["frames"], frames
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"expected a rectification of this workflow at {path}, got an archive that lacks {error}; "
+            "delete the file and run again"
+        ) from None
+    finally:
+        archive.close()
+    return pair
+
+
+def disparity_meta(pair: PairRectification, sigma_px: float) -> dict[str, Any]:
+    """The meta of a disparity file."""
+    return {"left": pair.left, "right": pair.right, "status": pair.status, "sigma_px": sigma_px}
+
+
+def add_disparity_frame(writer: ArchiveWriter, frame: int, disparity: PairDisparity) -> None:
+    """Append one frame to a disparity file, with its rectification."""
+    writer.add_frame(
+        frame,
+        left_disparity=encode_disparity(disparity.left_disparity),
+        right_disparity=encode_disparity(disparity.right_disparity),
+        left_confidence=encode_confidence(disparity.left_confidence),
+        right_confidence=encode_confidence(disparity.right_confidence),
+        **disparity.rectification.to_arrays(),
+    )
+
+
+def read_disparity_frame(archive: Archive, frame: int) -> PairDisparity:
+    """One frame of a disparity file.
+
+    Raises InputError if the pair was refused or the frame is not in the file.
+    """
+    if archive.meta["status"] != STATUS_OK:
+        raise InputError(
+            f"expected disparities in {archive.path}, got a refused pair ({archive.meta['status']}): "
+            "leave the pair out"
+        )
+    try:
+        arrays = archive.frame(frame)
+    except KeyError:
+        raise InputError(
+            f"expected frame {frame} in {archive.path}, got frames {archive.frames()}: ask for the chunk "
+            "that holds it"
+        ) from None
+    height, width = arrays["left_disparity"].shape
+    return PairDisparity(
+        Rectification.from_arrays(arrays, (width, height)),
+        decode_disparity(arrays["left_disparity"]),
+        decode_disparity(arrays["right_disparity"]),
+        decode_confidence(arrays["left_confidence"]),
+        decode_confidence(arrays["right_confidence"]),
+        float(archive.meta["sigma_px"]),
+    )
+
+
+def encode_disparity(disparity: np.ndarray) -> np.ndarray:
+    """(H, W) float px, NaN invalid, to int16 in units of 1/32 px, -32768 invalid.
+
+    Raises ValueError if a disparity does not fit into 16 bits.
+    """
+    valid = np.isfinite(disparity)
+    fixed = np.rint(np.where(valid, disparity, 0) * np.float32(DISPARITY_UNITS_PER_PX))
+    if np.abs(fixed).max(initial=0) > np.iinfo(np.int16).max:
+        raise ValueError(f"disparities up to {np.nanmax(np.abs(disparity)):.0f} px do not fit into the file")
+    return np.where(valid, fixed, INVALID_DISPARITY).astype(np.int16)
+
+
+def decode_disparity(fixed: np.ndarray) -> np.ndarray:
+    """Inverse of `encode_disparity`: (H, W) float32 px, NaN invalid."""
+    return np.where(
+        fixed == INVALID_DISPARITY, np.float32(np.nan), fixed / np.float32(DISPARITY_UNITS_PER_PX)
+    )
+
+
+def encode_confidence(confidence: np.ndarray) -> np.ndarray:
+    """(H, W) float 0..1 to uint8, 255 = 1."""
+    return np.rint(confidence * np.float32(255)).astype(np.uint8)
+
+
+def decode_confidence(levels: np.ndarray) -> np.ndarray:
+    """Inverse of `encode_confidence`: (H, W) float32."""
+    return levels / np.float32(255)
