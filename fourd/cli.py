@@ -10,6 +10,7 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 from fourd.errors import InputError
@@ -70,14 +71,20 @@ def flags_from_mapping(section: Mapping[str, Any]) -> str:
     for key, value in section.items():
         if isinstance(value, Mapping):
             continue
-        words.append("--" + key.replace("_", "-"))
-        if isinstance(value, bool):
-            words.append(str(value).lower())
-        elif isinstance(value, list | tuple):
-            words.extend(str(item) for item in value)
+        flag = "--" + key.replace("_", "-")
+        if isinstance(value, list | tuple):
+            words += [flag, *map(str, value)]
         else:
-            words.append("none" if value is None else str(value))
+            # One word, so that argparse does not take a value such as -1e-5 for a flag.
+            word = "none" if value is None else str(value)
+            words.append(f"{flag}={word.lower() if isinstance(value, bool) else word}")
     return shlex.join(words)
+
+
+def named_path(word: str) -> tuple[str, Path]:
+    """`NAME=PATH`, or a path whose stem is the name: how a flag maps cameras to files."""
+    name, separator, path = word.partition("=")
+    return (name, Path(path)) if separator and "/" not in name else (Path(word).stem, Path(word))
 
 
 def set_num_threads(num_threads: int) -> None:

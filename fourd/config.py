@@ -11,6 +11,7 @@ import jsonschema
 import yaml
 
 from fourd.errors import InputError
+from fourd.trajectory import scene_frames
 
 SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "config" / "schemas"
 SAMPLES = "samples"
@@ -273,3 +274,19 @@ def check_sources(scene: Scene, made_by_rules: tuple[str, ...]) -> None:
                 f"scene {scene.name}, {what}: expected a file or folder at {path}, found nothing: "
                 f"correct the path in config/scenes/{scene.name}.yaml (paths start at {Path.cwd()})"
             )
+
+
+def view_frames(scene: Scene, config: Mapping[str, Any]) -> dict[str, dict[int, int]]:
+    """Output frame -> scene frame, for every physical camera and every trajectory.
+
+    Raises InputError if a trajectory shows a frame that the clip does not have, or has a camera's name.
+    """
+    frames = {}
+    for cameras, key in ((scene.inputs, "train_frames"), (scene.heldout, "heldout_frames")):
+        for name in cameras:
+            frames[name] = {f: f for f in spread_frames(scene.num_frames, config["views"][key])}
+    for name, spec in config["trajectories"].items():
+        if name in frames:
+            raise InputError(f"trajectory {name!r} has the name of a camera: rename one of them")
+        frames[name] = dict(enumerate(scene_frames(spec, scene.num_frames)))
+    return frames

@@ -13,7 +13,6 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 )
 
 from fourd import config as fourd_config
-from fourd import trajectory
 from fourd.cli import flags_from_mapping
 from fourd.errors import InputError
 
@@ -24,6 +23,8 @@ try:
     CHUNK_FRAMES = fourd_config.fit_chunk_frames(config, SCENE)
     # What rules make or fetch need not be there yet.
     fourd_config.check_sources(SCENE, made_by_rules=("data/demo/", "data/pose2sim/"))
+    # Output frame -> scene frame, for every place that is filmed from.
+    VIEW_FRAMES = fourd_config.view_frames(SCENE, config)
 except InputError as error:
     raise WorkflowError(str(error)) from None
 
@@ -31,19 +32,6 @@ TRAJECTORIES = config["trajectories"]
 CHUNKS = fourd_config.chunk_names(SCENE.num_frames, CHUNK_FRAMES)
 LEVELS = range(fourd_config.num_levels(SCENE, config))
 SAMPLE_FRAMES = fourd_config.spread_frames(SCENE.num_frames, config["background"]["num_samples"])
-
-# Output frame -> scene frame, for every place that is filmed from.
-VIEW_FRAMES = {
-    **{
-        cam: {f: f for f in fourd_config.spread_frames(SCENE.num_frames, config["views"][key])}
-        for cams, key in ((SCENE.inputs, "train_frames"), (SCENE.heldout, "heldout_frames"))
-        for cam in cams
-    },
-    **{
-        name: dict(enumerate(trajectory.scene_frames(spec, SCENE.num_frames)))
-        for name, spec in TRAJECTORIES.items()
-    },
-}
 
 
 def chunks_of_view(view):

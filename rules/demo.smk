@@ -3,12 +3,12 @@
 # The scene file says how much of the event is filmed, the section `demo` how the event looks.
 DEMO_FLAGS = flags_from_mapping(
     {
+        **config["demo"],
         "num_cameras": len(SCENE.cameras),
         "num_frames": SCENE.num_frames,
         "fps": SCENE.fps,
         "width": SCENE.size[0],
         "height": SCENE.size[1],
-        **config["demo"],
     }
 )
 

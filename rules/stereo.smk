@@ -12,7 +12,7 @@ def ingest_of_pair(wildcards):
 def disparity_frames(wildcards):
     if wildcards.chunk == "samples":
         return SAMPLE_FRAMES
-    return fourd_config.frames_of_chunk(wildcards.chunk)
+    return list(fourd_config.frames_of_chunk(wildcards.chunk))
 
 
 rule rectify_pair:

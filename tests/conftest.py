@@ -73,5 +73,3 @@ def tiny_scene(num_cameras: int = 5, num_frames: int = 6) -> dict:
             "composition": {"num_filters": [4, 4, 4], "epochs": 2},
         },
     }
-
-

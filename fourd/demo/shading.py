@@ -4,13 +4,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from fourd.demo.raycast import (
     TILE_PX,
     CellLists,
     Geometry,
     is_blocked,
+    kernel,
     local_surface,
     nearest_hit,
     to_local,
@@ -22,6 +22,8 @@ MAX_PROBES = 8
 LEVEL_BIAS = -0.4
 SKY_TEXTURE = 0
 SKY_TOP_RAD, SKY_BOTTOM_RAD = 0.70, -0.08
+# Sky pictures hold at most 1; the sky is brighter than a white wall.
+SKY_GAIN = 1.9
 EXPOSURE = 0.62
 
 
@@ -57,7 +59,7 @@ class World(NamedTuple):
     all_lists: CellLists
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _bilinear(textures, texture, level, u, v):
     """Encoded colour at u, v in repeats of the texture."""
     offset, width, height = textures.levels[texture, level]
@@ -81,7 +83,7 @@ def _bilinear(textures, texture, level, u, v):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def sample_texture(textures, texture, u, v, major_u, major_v, minor):
     """Linear colour averaged over an elongated footprint.
 
@@ -111,17 +113,19 @@ def sample_texture(textures, texture, u, v, major_u, major_v, minor):
     return r * r, g * g, b * b
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def sky_color(world, dx, dy, dz, pixel_rad):
     """Linear colour of the sky and the hills along a direction."""
     elevation = math.atan2(dz, math.sqrt(dx * dx + dy * dy))
     top = min(SKY_TOP_RAD, max(SKY_BOTTOM_RAD, elevation)) - SKY_BOTTOM_RAD
     span = SKY_TOP_RAD - SKY_BOTTOM_RAD
     top = min(span * 0.995, max(span * 0.005, top))
-    return sample_texture(world.textures, SKY_TEXTURE, math.atan2(dx, dy), top, 0.0, 0.0, pixel_rad)
+    azimuth = math.atan2(dx, dy)
+    r, g, b = sample_texture(world.textures, SKY_TEXTURE, azimuth, top, 0.0, 0.0, pixel_rad)
+    return SKY_GAIN * r, SKY_GAIN * g, SKY_GAIN * b
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def is_in_shadow(world, x, y, z):
     """Whether the sun is hidden from a world point."""
     axes, grid = world.light_axes, world.light_grid
@@ -135,7 +139,7 @@ def is_in_shadow(world, x, y, z):
     return is_blocked(world.geometry, world.shadow_lists, cell, x, y, z, sun[0], sun[1], sun[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def sky_visibility(world, label, x, y, z, nx, ny, nz):
     """Share of sky light that nearby spheres leave. Source: solid angle of a sphere, cosine weighted."""
     hidden = 0.0
@@ -153,7 +157,7 @@ def sky_visibility(world, label, x, y, z, nx, ny, nz):
     return 1.0 - min(0.8, hidden)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _albedo(world, i, u, v, axis, dx, dy, dz, nx, ny, nz, facing, footprint):
     """Linear reflectance at a hit, filtered over the pixel's footprint on the surface."""
     m = world.materials[world.geometry.material[i]]
@@ -167,7 +171,7 @@ def _albedo(world, i, u, v, axis, dx, dy, dz, nx, ny, nz, facing, footprint):
         px, py, pz = dx + facing * nx, dy + facing * ny, dz + facing * nz
         norm = math.sqrt(px * px + py * py + pz * pz) + 1e-12
         qx, qy, qz = to_local(world.geometry.linear[i], px / norm, py / norm, pz / norm)
-        along_u = (qy if axis == 0 else qx) * footprint * slant
+        along_u = (qy if axis % 4 == 0 else qx) * footprint * slant * (-1.0 if axis >= 4 else 1.0)
         along_v = (qy if axis == 2 else qz) * footprint * slant
     else:
         minor = footprint * min(3.0, math.sqrt(slant))
@@ -175,7 +179,7 @@ def _albedo(world, i, u, v, axis, dx, dy, dz, nx, ny, nz, facing, footprint):
     return r * m[1], g * m[2], b * m[3]
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def shade_hit(world, i, t, ox, oy, oz, dx, dy, dz, pixel_rad):
     """Linear colour of primitive i at t, without reflection.
 
@@ -215,7 +219,7 @@ def shade_hit(world, i, t, ox, oy, oz, dx, dy, dz, pixel_rad):
     return r, gr, b, nx, ny, nz, ((i + 1) * 8 + axis + 1) * 2 + lit
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def radiance(world, lists, cell, ox, oy, oz, dx, dy, dz, pixel_rad):
     """Linear colour along a ray, with one reflection.
 
@@ -246,13 +250,13 @@ def radiance(world, lists, cell, ox, oy, oz, dx, dy, dz, pixel_rad):
     return r, g, b, t, i, surface
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _tone(value):
     """Mild shoulder, linear radiance to [0, 1)."""
     return 1 - math.exp(-EXPOSURE * 1.45 * value)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def render_pixels(world, tiles, K, world_from_cam, center, samples, color, depth, label, surface):
     """Fill one picture: a ray through every pixel's centre, more rays where surfaces meet.
 
@@ -289,7 +293,7 @@ def render_pixels(world, tiles, K, world_from_cam, center, samples, color, depth
                 color[row, column, 2] = blue / (n * n)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def _is_mixed(world, surface, row, column):
     here = surface[row, column]
     if here > 0 and world.materials[world.geometry.material[here // 16 - 1], 6] > 0.2:
@@ -302,7 +306,7 @@ def _is_mixed(world, surface, row, column):
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def trace_depth(geometry, tiles, K, world_from_cam, center, depth, label):
     """Depth and labels of pixel centres only, the same rays as `render_pixels`."""
     height, width = depth.shape

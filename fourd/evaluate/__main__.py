@@ -11,12 +11,6 @@ from fourd.evaluate.camera import Sources, run_camera
 from fourd.evaluate.table import run_collect
 
 
-def _named_path(word: str) -> tuple[str, Path]:
-    """`cam03=results/demo/ingest/cam03.json`, or the path alone, whose stem is then the name."""
-    name, separator, path = word.partition("=")
-    return (name, Path(path)) if separator else (Path(word).stem, Path(word))
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """Command line of the stage."""
     parser = argparse.ArgumentParser(prog="python -m fourd.evaluate")
@@ -24,7 +18,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     camera = commands.add_parser("camera", help="score one held-out camera")
     camera.add_argument("--view-file", type=Path, required=True)
     camera.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
-    camera.add_argument("--ingest", type=_named_path, nargs="+", required=True, metavar="CAM=FILE")
+    camera.add_argument("--ingest", type=cli.named_path, nargs="+", required=True, metavar="CAM=FILE")
     camera.add_argument("--rendered", type=Path, nargs="+", required=True, help="folders of the stage render")
     camera.add_argument("--foreground", type=Path, nargs="+", required=True)
     camera.add_argument("--background", type=Path, nargs="+", required=True)

@@ -10,47 +10,35 @@ points at infinity are ordinary.
 """
 
 import dataclasses
-from typing import Protocol
 
 import numpy as np
 
 from fourd.camera import Camera
+from fourd.fuse.options import MAX_REACH_PX
 
 
-class PairDisparity(Protocol):
-    """What fusion reads of one pair at one frame (`docs/formats.md`, disparity).
+@dataclasses.dataclass(frozen=True, eq=False)
+class PairFrame:
+    """The disparities of one pair at one frame, with what places them in the world.
 
-    left, right: names of the cameras;  K_left, K_right, R: (3, 3) rectified_from_world
+    left, right: names of the cameras;  K_left, K_right, R: (3, 3), R is rectified_from_world
     center_left, center_right: (3,) world;  baseline: world units;  sigma_px: noise at confidence 1
     *_disparity: (H, W) float32 px, NaN where invalid;  *_confidence: (H, W) float32 in 0..1
     """
 
-    @property
-    def left(self) -> str: ...
-    @property
-    def right(self) -> str: ...
-    @property
-    def K_left(self) -> np.ndarray: ...
-    @property
-    def K_right(self) -> np.ndarray: ...
-    @property
-    def R(self) -> np.ndarray: ...
-    @property
-    def center_left(self) -> np.ndarray: ...
-    @property
-    def center_right(self) -> np.ndarray: ...
-    @property
-    def baseline(self) -> float: ...
-    @property
-    def sigma_px(self) -> float: ...
-    @property
-    def left_disparity(self) -> np.ndarray: ...
-    @property
-    def right_disparity(self) -> np.ndarray: ...
-    @property
-    def left_confidence(self) -> np.ndarray: ...
-    @property
-    def right_confidence(self) -> np.ndarray: ...
+    left: str
+    right: str
+    K_left: np.ndarray
+    K_right: np.ndarray
+    R: np.ndarray
+    center_left: np.ndarray
+    center_right: np.ndarray
+    baseline: float
+    left_disparity: np.ndarray
+    right_disparity: np.ndarray
+    left_confidence: np.ndarray
+    right_confidence: np.ndarray
+    sigma_px: float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,7 +59,7 @@ class DisparityMap:
     sigma_px: np.float32
 
 
-def maps_of_pair(pair: PairDisparity, target: Camera) -> tuple[DisparityMap, DisparityMap]:
+def maps_of_pair(pair: PairFrame, target: Camera) -> tuple[DisparityMap, DisparityMap]:
     """The left and the right disparity map of a pair with their projections to the target."""
     per_px = 1.0 / (pair.K_left[0, 0] * pair.baseline)
     shared = (
@@ -155,16 +143,24 @@ def _largest_radius_squared(camera: Camera) -> float:
 
 
 def source_rows(
-    disparity_map: DisparityMap, tile_rows: tuple[int, int], inverse_depths: tuple[float, float]
+    disparity_map: DisparityMap, tile_rows: tuple[int, int], target_height: int
 ) -> tuple[int, int]:
     """Range of rows of a disparity map that can touch rows [first, last) of the target.
 
-    inverse_depths: least and greatest in the map, source frame, world units^-1
     Returns (first, last); a superset, because only bounds enter. Where P2 > 0 at the four corners
     of a source row's (x, s) rectangle, v is a ratio of two linear functions and is extreme there.
     """
-    height, width = disparity_map.disparity.shape
-    A, b = disparity_map.A.astype(np.float64), disparity_map.b.astype(np.float64)
+    m = disparity_map
+    height, width = m.disparity.shape
+    if tile_rows == (0, target_height):
+        return 0, height
+    extent = np.array([np.fmin.reduce(m.disparity, axis=None), np.fmax.reduce(m.disparity, axis=None)])
+    if not np.isfinite(extent).all():
+        return 0, height
+    inverse_depths = np.maximum(
+        (extent.astype(np.float64) - m.disparity_at_infinity) * m.inverse_depth_per_px, 0.0
+    )
+    A, b = m.A.astype(np.float64), m.b.astype(np.float64)
     y = np.arange(height, dtype=np.float64)
     low, high = np.full(height, np.inf), np.full(height, -np.inf)
     always = np.zeros(height, dtype=bool)
@@ -176,6 +172,6 @@ def source_rows(
             v = v1 / np.where(v2 > 0, v2, 1.0)
             low, high = np.minimum(low, v), np.maximum(high, v)
     # One more row for rounding in float32.
-    margin = 17.0
+    margin = MAX_REACH_PX + 1
     touched = np.flatnonzero(always | ((low - margin < tile_rows[1]) & (high + margin >= tile_rows[0])))
     return (int(touched[0]), int(touched[-1]) + 1) if touched.size else (0, 0)

@@ -7,23 +7,17 @@ taken in an order that the data fix, so a result depends neither on threads nor 
 import numpy as np
 from numba import njit
 
-from fourd.fuse.options import (
-    INFINITY_SIGMAS,
-    MAX_REACH_PX,
-    MAX_STEP_PX,
-    MIN_SINE_SQUARED,
-    SIGMA_FLOOR,
-)
+from fourd.fuse.options import INFINITY_SIGMAS, MAX_REACH_PX, MAX_STEP_PX, SIGMA_FLOOR
 
 BLANK = np.float32(-1)
 _ONE = np.float32(1)
 _ZERO = np.float32(0)
+_LOW_BITS = np.uint32(0xFFFFFFFF)
 _HALF = np.float32(0.5)
 _STEP = np.float32(MAX_STEP_PX)
 _REACH = np.float32(MAX_REACH_PX)
 _INFINITY_SIGMAS = np.float32(INFINITY_SIGMAS)
 _SIGMA_FLOOR = np.float32(SIGMA_FLOOR)
-_MIN_SINE = np.float32(MIN_SINE_SQUARED)
 
 
 @njit(cache=True, nogil=True)
@@ -109,43 +103,65 @@ def _project_row(points, count, y, A, b, footprint, patches):
 
 
 @njit(cache=True, nogil=True)
-def _splat_row(patches, count, first_row, footprint, inverse_depth, sigma):
-    """z-test the patches of a row into the tile. Equal depths: the smaller sigma stays."""
-    height, width = inverse_depth.shape
-    for i in range(count):
-        t = patches[2, i]
-        if not t >= _ZERO:
-            continue
-        u, v = patches[0, i], patches[1, i] - first_row
-        reach_u, reach_v = patches[4, i], patches[5, i]
-        inside = (u + reach_u >= _ZERO) and (u - reach_u <= np.float32(width - 1))
-        if not (inside and v + reach_v >= _ZERO and v - reach_v <= np.float32(height - 1)):
-            continue
-        x0, x1 = max(0, int(np.ceil(u - reach_u))), min(width - 1, int(np.floor(u + reach_u)))
-        y0, y1 = max(0, int(np.ceil(v - reach_v))), min(height - 1, int(np.floor(v + reach_v)))
-        xu, xv, yu, yv = patches[6, i], patches[7, i], patches[8, i], patches[9, i]
-        tu, tv, s = patches[10, i], patches[11, i], patches[3, i]
-        for y in range(y0, y1 + 1):
-            dv = np.float32(y) - v
-            for x in range(x0, x1 + 1):
-                du = np.float32(x) - u
-                if abs(xu * du + xv * dv) > footprint or abs(yu * du + yv * dv) > footprint:
-                    continue
-                here = max(t + (tu * du + tv * dv), _ZERO)
-                there = inverse_depth[y, x]
-                if here > there or (here == there and s < sigma[y, x]):
-                    inverse_depth[y, x] = here
-                    sigma[y, x] = s
+def _key(t, tu, tv, du, dv, xu, xv, yu, yv, footprint, low):
+    """What a patch offers to a pixel (du, dv) from its centre; 0 outside the patch.
+
+    Positive floats are ordered as their bits are: the greater key is the greater inverse depth, and
+    at equal depth the smaller sigma. One unsigned maximum is the whole z-test.
+    """
+    here = np.float32(max(t + (tu * du + tv * dv), _ZERO))
+    inside = (abs(xu * du + xv * dv) <= footprint) & (abs(yu * du + yv * dv) <= footprint)
+    key = (np.uint64(here.view(np.uint32)) << np.uint64(32)) | low
+    return key if inside else np.uint64(0)
 
 
 @njit(cache=True, nogil=True)
-def splat_map(disparity, confidence, A, b, scalars, rows, first_row, footprint, inverse_depth, sigma):
+def _splat_row(patches, count, first_row, footprint, keys):
+    """z-test the patches of a row into the tile."""
+    height, width = keys.shape
+    last_row = first_row + height - 1
+    right, top, bottom = np.float32(width - 1), np.float32(first_row), np.float32(last_row)
+    for i in range(count):
+        t = patches[2, i]
+        u, v = patches[0, i], patches[1, i]
+        reach_u, reach_v = patches[4, i], patches[5, i]
+        inside = (u + reach_u >= _ZERO) & (u - reach_u <= right)
+        if not ((t >= _ZERO) & inside & (v + reach_v >= top) & (v - reach_v <= bottom)):
+            continue
+        xu, xv, yu, yv = patches[6, i], patches[7, i], patches[8, i], patches[9, i]
+        tu, tv = patches[10, i], patches[11, i]
+        low = np.uint64(_LOW_BITS - np.float32(patches[3, i]).view(np.uint32))
+        left, upper = np.ceil(u - reach_u), np.ceil(v - reach_v)
+        x0, y0 = int(left), int(upper)
+        small = (reach_u < _ONE) & (reach_v < _ONE)
+        if small & (x0 >= 0) & (x0 + 1 < width) & (y0 >= first_row) & (y0 < last_row):
+            # The usual case, without loops whose length nobody can predict.
+            du, dv, y = left - u, upper - v, y0 - first_row
+            key = _key(t, tu, tv, du, dv, xu, xv, yu, yv, footprint, low)
+            keys[y, x0] = max(keys[y, x0], key)
+            key = _key(t, tu, tv, du + _ONE, dv, xu, xv, yu, yv, footprint, low)
+            keys[y, x0 + 1] = max(keys[y, x0 + 1], key)
+            key = _key(t, tu, tv, du, dv + _ONE, xu, xv, yu, yv, footprint, low)
+            keys[y + 1, x0] = max(keys[y + 1, x0], key)
+            key = _key(t, tu, tv, du + _ONE, dv + _ONE, xu, xv, yu, yv, footprint, low)
+            keys[y + 1, x0 + 1] = max(keys[y + 1, x0 + 1], key)
+            continue
+        x1, y1 = int(min(right, np.floor(u + reach_u))), int(min(bottom, np.floor(v + reach_v)))
+        for y in range(max(first_row, y0), y1 + 1):
+            for x in range(max(0, x0), x1 + 1):
+                du, dv = np.float32(x) - u, np.float32(y) - v
+                key = _key(t, tu, tv, du, dv, xu, xv, yu, yv, footprint, low)
+                keys[y - first_row, x] = max(keys[y - first_row, x], key)
+
+
+@njit(cache=True, nogil=True)
+def splat_map(disparity, confidence, A, b, scalars, rows, first_row, footprint, keys):
     """Project rows of a disparity map and z-test them into a tile of the target.
 
     disparity, confidence: (H, W) float32, px and 0..1;  A: (3, 3), b: (3,) float32 (geometry.py)
     scalars: (3,) float32 disparity at infinity, inverse depth per px, sigma_px
     rows: first and last row of the map to read;  first_row: the tile's first row
-    inverse_depth, sigma: (h, W_target) float32, changed in place; inverse_depth starts BLANK
+    keys: (h, W_target) uint64 `_key`, changed in place; starts 0 = blank
 
     A source pixel is a planar patch `2 * footprint` wide. Its slope comes from the neighbours on
     the same surface. Inverse depth is linear on the image of a plane, so the target pixels inside
@@ -163,15 +179,24 @@ def splat_map(disparity, confidence, A, b, scalars, rows, first_row, footprint, 
     for y in range(rows[0], rows[1]):
         count = _collect_row(disparity, confidence, y, scalars, points)
         _project_row(points, count, np.float32(y), A, b, footprint, patches)
-        _splat_row(patches, count, np.float32(first_row), footprint, inverse_depth, sigma)
+        _splat_row(patches, count, first_row, footprint, keys)
         total += count
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def merge_maps(left, left_sigma, right, right_sigma, tolerance, inverse_depth, sigma):
-    """One layer from the two maps of a pair, all (h, W) float32; results in the last two.
+@njit(cache=True, nogil=True)
+def _unpack(key):
+    """Inverse depth (BLANK for 0) and sigma of a key."""
+    t = np.uint32(key >> np.uint64(32)).view(np.float32)
+    low = np.uint32(key & np.uint64(0xFFFFFFFF))
+    return (t if key > np.uint64(0) else BLANK), np.uint32(_LOW_BITS - low).view(np.float32)
 
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def merge_maps(left, right, tolerance, inverse_depth, sigma):
+    """One layer from the two maps of a pair.
+
+    left, right: (h, W) uint64 keys;  inverse_depth, sigma: (h, W) float32, changed in place
     Where both see one surface: their precision-weighted mean, with the smaller sigma, because one
     image pair made both. Elsewhere the closer.
     """
@@ -179,11 +204,133 @@ def merge_maps(left, left_sigma, right, right_sigma, tolerance, inverse_depth, s
     squared = tolerance * tolerance
     for y in range(height):
         for x in range(width):
-            a, b = left[y, x], right[y, x]
-            sa, sb = left_sigma[y, x], right_sigma[y, x]
+            a, sa = _unpack(left[y, x])
+            b, sb = _unpack(right[y, x])
             va, vb = sa * sa, sb * sb
             agree = (a >= _ZERO) & (b >= _ZERO) & ((a - b) * (a - b) <= squared * (va + vb))
             mean = b + (a - b) * (vb / (va + vb))
-            a_wins = a > b or (a == b and sa < sb)
-            inverse_depth[y, x] = mean if agree else (a if a_wins else b)
-            sigma[y, x] = min(sa, sb) if agree else (sa if a_wins else sb)
+            left_wins = left[y, x] > right[y, x]
+            inverse_depth[y, x] = mean if agree else (a if left_wins else b)
+            sigma[y, x] = min(sa, sb) if agree else (sa if left_wins else sb)
+
+
+@njit(cache=True, nogil=True)
+def _gather_sorted(inverse_depths, sigmas, y, x, t, sigma, pair):
+    """Samples of one pixel, closest first (equal depth: smaller sigma first). Returns their number."""
+    count = 0
+    for p in range(inverse_depths.shape[0]):
+        value = inverse_depths[p, y, x]
+        if value < _ZERO:
+            continue
+        spread = sigmas[p, y, x]
+        i = count
+        while i > 0 and (t[i - 1] < value or (t[i - 1] == value and sigma[i - 1] > spread)):
+            t[i], sigma[i], pair[i] = t[i - 1], sigma[i - 1], pair[i - 1]
+            i -= 1
+        t[i], sigma[i], pair[i] = value, spread, p
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _support(t, sigma, pair, count, index, squared, masks):
+    """Samples that agree with one: how many, how many of them are closer, the cameras of their pairs."""
+    number = closer = 0
+    cameras = np.uint64(0)
+    variance = sigma[index] * sigma[index]
+    for j in range(count):
+        difference = t[j] - t[index]
+        if difference * difference <= squared * (variance + sigma[j] * sigma[j]):
+            number += 1
+            closer += j < index
+            cameras |= masks[pair[j]]
+    return number, closer, cameras
+
+
+@njit(cache=True, nogil=True)
+def _num_bits(mask):
+    number = 0
+    while mask != np.uint64(0):
+        mask &= mask - np.uint64(1)
+        number += 1
+    return number
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fused(t, sigma, count, index, squared):
+    """Precision-weighted mean of the samples that agree with one, summed closest first."""
+    total, weights = _ZERO, _ZERO
+    variance = sigma[index] * sigma[index]
+    for j in range(count):
+        difference = t[j] - t[index]
+        spread = sigma[j] * sigma[j]
+        if difference * difference <= squared * (variance + spread):
+            weight = variance / spread
+            total += weight * difference
+            weights += weight
+    return max(t[index] + total / weights, _ZERO)
+
+
+@njit(cache=True, nogil=True)
+def _find_consensus(t, sigma, pair, count, squared, max_front, rules, masks):
+    """The closest sample that enough pairs and cameras support; -1 if there is none or it is hidden."""
+    for i in range(count):
+        number, closer, cameras = _support(t, sigma, pair, count, i, squared, masks)
+        if number >= rules[0] and _num_bits(cameras) >= rules[1]:
+            in_front = np.float32(i - closer)
+            return -1 if in_front > max_front * np.float32(number) else i
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _find_farthest(t, sigma, pair, count, squared, rules, masks):
+    """The farthest sample that enough pairs support; the farthest of all if there is none."""
+    for i in range(count - 1, -1, -1):
+        if rules[2] == 1 or _support(t, sigma, pair, count, i, squared, masks)[0] >= rules[2]:
+            return i
+    return count - 1
+
+
+@njit(cache=True, nogil=True)
+def reduce_layers(
+    inverse_depths, sigmas, masks, tolerance, max_front, rules, wanted, chosen, cameras, counts
+):
+    """The four estimates of every pixel from the layers of all pairs.
+
+    inverse_depths, sigmas: (P, h, W) float32, blank < 0;  masks: (P,) uint64 cameras of each pair
+    tolerance: float32, combined sigmas;  max_front: float32, samples in front per supporter
+    wanted: (4,) bool consensus, closest, median, farthest
+    rules: (3,) int64 min_pairs, min_cameras, pairs that the farthest needs
+    chosen: (4, h, W) float32 inverse depth;  cameras: (4, h, W) uint64 of the pairs that agree with it
+    counts: (2, h, W) uint8 pairs and distinct cameras of the consensus (0 = blank); all three changed
+    """
+    num_pairs, height, width = inverse_depths.shape
+    t, sigma = np.empty(num_pairs, np.float32), np.empty(num_pairs, np.float32)
+    pair = np.empty(num_pairs, np.int64)
+    squared = tolerance * tolerance
+    picks = np.empty(4, np.int64)
+    for y in range(height):
+        for x in range(width):
+            count = _gather_sorted(inverse_depths, sigmas, y, x, t, sigma, pair)
+            for e in range(4):
+                chosen[e, y, x] = BLANK
+                cameras[e, y, x] = np.uint64(0)
+            counts[0, y, x] = counts[1, y, x] = np.uint8(0)
+            if count == 0:
+                continue
+            picks[0], picks[1], picks[2], picks[3] = -1, 0, (count - 1) // 2, -1
+            if wanted[0] and count >= rules[0]:
+                picks[0] = _find_consensus(t, sigma, pair, count, squared, max_front, rules, masks)
+            if wanted[3]:
+                picks[3] = _find_farthest(t, sigma, pair, count, squared, rules, masks)
+            for e in range(4):
+                index = picks[e]
+                if index < 0 or not wanted[e]:
+                    continue
+                number, _, mask = _support(t, sigma, pair, count, index, squared, masks)
+                chosen[e, y, x] = t[index]
+                cameras[e, y, x] = mask
+                if e == 0:
+                    chosen[e, y, x] = _fused(t, sigma, count, index, squared)
+                    counts[0, y, x] = np.uint8(min(number, 255))
+                    counts[1, y, x] = np.uint8(_num_bits(mask))

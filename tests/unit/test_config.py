@@ -17,8 +17,8 @@ from fourd.errors import InputError
 OPTIONS = {
     "ingest": "fourd.ingest.IngestOptions",
     "sfm": "fourd.sfm.SfmOptions",
-    "rectify": "fourd.stereo.RectifyOptions",
-    "stereo": "fourd.stereo.StereoOptions",
+    "rectify": "fourd.stereo.volume.RectifyOptions",
+    "stereo": "fourd.stereo.check.StereoOptions",
     "fuse": "fourd.fuse.FuseOptions",
     "background": "fourd.background.BackgroundOptions",
     "composition": "fourd.composition.CompositionOptions",
@@ -125,5 +125,5 @@ def test_spread_frames_are_distinct_and_inside(num_frames: int, count: int) -> N
 
 def test_flags_quote_what_a_shell_would_eat() -> None:
     assert flags_from_mapping({"some_key": "a; rm -rf b", "flag": True, "sizes": [1, 2], "none": None}) == (
-        "--some-key 'a; rm -rf b' --flag true --sizes 1 2 --none none"
+        "'--some-key=a; rm -rf b' --flag=true --sizes 1 2 --none=none"
     )

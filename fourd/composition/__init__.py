@@ -1,0 +1,40 @@
+"""Self-supervised composition of instantaneous foreground and static background (section 3.3, 4).
+
+`model` is the network, `losses` what it minimises, `data` the samples, `train` the page that fits
+it to a scene, `infer` its use: one frame through the levels, coarse to fine.
+"""
+
+import dataclasses
+
+STAGE_VERSION = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class CompositionOptions:
+    """What one level's network is and how it is trained; the meaning of each key is in the schema."""
+
+    num_filters: tuple[int, ...] = (28, 23, 13)
+    unet_width: int = 1
+    depth: int = 4
+    head: str = "blend"
+    test_input_share: float = 0.5
+    l1_weight: float = 100.0
+    adversarial_weight: float = 1.0
+    frequency_weight: float = 100.0
+    epochs: int = 10
+    learning_rate: float = 2e-4
+    max_scale: float = 1.5
+    crop: int | None = None
+    validation_samples: int = 4
+    seed: int = 0
+    max_minutes: float | None = None
+    checkpoint_s: float = 60.0
+    cache_mb: int = 1024
+
+
+@dataclasses.dataclass(frozen=True)
+class CascadeOptions:
+    """When a frame needs the coarser levels; read at test time only, so a change retrains nothing."""
+
+    min_hole_share: float = 0.02
+    min_largest_hole_share: float = 0.005

@@ -1,0 +1,188 @@
+"""One frame through the trained levels, coarse to fine, and the plain paste it is measured against.
+
+Section 4.1: the output of a level fills the holes of the next level's inputs. It is done only for
+frames with large holes, and only from as coarse a level as they need.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from fourd.composition import CascadeOptions
+from fourd.composition.checkpoint import read_torch
+from fourd.composition.data import (
+    ESTIMATES,
+    TEST_STREAMS,
+    reduce_image,
+    reduction_factor,
+    streams_from_images,
+)
+from fourd.composition.model import CompositionNet
+from fourd.composition.model import paste as paste_streams
+from fourd.errors import InputError
+from fourd.image import uint8_from_float
+
+MODEL_KEYS = ("level", "num_levels", "network", "state_dict")
+
+Arrays = Mapping[str, np.ndarray]
+
+
+def load_models(paths: Sequence[Path], device: str = "cpu") -> list[CompositionNet]:
+    """The networks of a cascade, coarsest first, ready for `compose_frame`.
+
+    paths: `composition/{level}/model.pt` of every level, in any order
+    Raises InputError if a file is missing, is no model, or the levels are not 0 to the last.
+    """
+    documents = sorted(
+        (read_torch(path, MODEL_KEYS) for path in paths), key=lambda document: document["level"]
+    )
+    levels = [document["level"] for document in documents]
+    num_levels = {document["num_levels"] for document in documents}
+    if num_levels != {len(levels)} or levels != list(range(len(levels))):
+        raise InputError(
+            f"expected one model per level, 0 to the last, got levels {levels} of cascades of "
+            f"{sorted(num_levels)} levels in {', '.join(map(str, paths))}: give the models of one training"
+        )
+    return [_network(document, device) for document in documents]
+
+
+def _network(document: Mapping[str, Any], device: str) -> CompositionNet:
+    network = CompositionNet(**document["network"])
+    network.load_state_dict(document["state_dict"])
+    return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+
+
+def run_network(network: CompositionNet, images: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 composed from test-time inputs.
+
+    images: (N, H, W, 4) uint8 RGBA, N > 3; consensus at 0 and static background at 3 are read
+    """
+    device = next(network.parameters()).device
+    with torch.inference_mode():
+        output = network(streams_from_images(images, TEST_STREAMS).to(device))
+    return _image(output)
+
+
+def paste_images(images: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8: consensus where valid, else static background, else the mean colour of these.
+
+    images: as for `run_network`
+    """
+    return _image(paste_streams(streams_from_images(images, TEST_STREAMS)))
+
+
+def paste(foreground: Arrays, background: Arrays) -> np.ndarray:
+    """The baseline without a network, (H, W, 3) uint8; arguments as for `compose_frame`."""
+    return paste_images(_stack(foreground, background, 1))
+
+
+def compose_frame(
+    models: Sequence[CompositionNet],
+    frame: int,
+    foreground: Arrays,
+    background: Arrays,
+    options: CascadeOptions | None = None,
+) -> tuple[np.ndarray, list[dict[str, Any]]]:
+    """One frame of a view.
+
+    models:     of `load_models`, coarsest first
+    frame:      output frame, for the report only
+    foreground: arrays of one frame of a foreground archive; `consensus_*` are read
+    background: arrays of one (resolved) frame of a background archive; `farthest_*` are read
+    Returns (H, W, 3) uint8 and a row per level that ran: `frame`, `level`, `hole_share` and
+    `largest_hole_share` of its inputs, `filled_share` (0 or hole_share), `reason`.
+    """
+    options = options or CascadeOptions()
+    num_levels = len(models)
+    level = num_levels - 1
+    inputs = {level: _stack(foreground, background, 1)}
+    while level > 0 and holes_are_large(find_holes(inputs[level]), options):
+        level -= 1
+        inputs[level] = _stack(foreground, background, reduction_factor(level, num_levels))
+    rows: list[dict[str, Any]] = []
+    image: np.ndarray | None = None
+    for level in sorted(inputs):
+        holes = find_holes(inputs[level])
+        rows.append(_describe(frame, level, holes, image is not None, options))
+        if image is not None:
+            fill_holes(inputs[level], holes, image)
+        image = run_network(models[level], inputs[level])
+    assert image is not None
+    return image, rows
+
+
+def find_holes(images: np.ndarray) -> np.ndarray:
+    """(H, W) bool: neither consensus nor static background is valid."""
+    return (images[TEST_STREAMS[0], ..., 3] == 0) & (images[TEST_STREAMS[-1], ..., 3] == 0)
+
+
+def hole_shares(holes: np.ndarray) -> tuple[float, float]:
+    """Share of the frame that is holes, and share of the largest hole (8-connected)."""
+    _, _, stats, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    return float(holes.mean()), float(areas.max() / holes.size) if areas.size else 0.0
+
+
+def holes_are_large(holes: np.ndarray, options: CascadeOptions) -> bool:
+    """Whether a frame's holes are to be filled from a coarser level."""
+    share, largest = hole_shares(holes)
+    return share > options.min_hole_share or largest > options.min_largest_hole_share
+
+
+def fill_holes(images: np.ndarray, holes: np.ndarray, coarser: np.ndarray) -> None:
+    """Put a coarser level's output into the holes of the static background, in place, as valid.
+
+    images: (N, H, W, 4) uint8;  holes: (H, W) bool;  coarser: (ceil(H / 2), ceil(W / 2), 3) uint8
+    """
+    height, width = coarser.shape[:2]
+    finer = cv2.resize(coarser, (2 * width, 2 * height), interpolation=cv2.INTER_LINEAR)
+    background = images[TEST_STREAMS[-1]]
+    background[holes, :3] = finer[: holes.shape[0], : holes.shape[1]][holes]
+    background[holes, 3] = 255
+
+
+def _describe(
+    frame: int, level: int, holes: np.ndarray, is_filled: bool, options: CascadeOptions
+) -> dict[str, Any]:
+    share, largest = hole_shares(holes)
+    if is_filled:
+        reason = "large holes, filled from the coarser level"
+    elif not holes_are_large(holes, options):
+        reason = "holes are small, no coarser level needed"
+    else:
+        reason = "large holes, but this is the coarsest level"
+    return {
+        "frame": frame,
+        "level": level,
+        "hole_share": share,
+        "largest_hole_share": largest,
+        "filled_share": share if is_filled else 0.0,
+        "reason": reason,
+    }
+
+
+def _stack(foreground: Arrays, background: Arrays, factor: int) -> np.ndarray:
+    """(4, H, W, 4) uint8 with consensus at 0 and static background at 3; the others are blank."""
+    arrays = {"foreground": foreground, "background": background}
+    images: np.ndarray | None = None
+    for index in sorted(set(TEST_STREAMS)):
+        kind, key = ESTIMATES[index]
+        image = reduce_image(arrays[kind][f"{key}_rgb"], arrays[kind][f"{key}_valid"], factor)
+        if images is None:
+            images = np.zeros((max(TEST_STREAMS) + 1, *image.shape), np.uint8)
+        if image.shape != images.shape[1:]:
+            raise InputError(
+                f"expected foreground and background of one size, got {images.shape[1:3]} and "
+                f"{image.shape[:2]} (height, width): run fuse and background again for this view"
+            )
+        images[index] = image
+    assert images is not None
+    return images
+
+
+def _image(output: torch.Tensor) -> np.ndarray:
+    return uint8_from_float(output[0].permute(1, 2, 0).cpu().numpy())

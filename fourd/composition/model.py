@@ -1,0 +1,171 @@
+"""The network: three foreground and three background streams, a U-Net, an image (figures 7 to 9)."""
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+NUM_FOREGROUND = 3
+NUM_STREAMS = 6
+STREAM_CHANNELS = 4
+HEADS = ("blend", "direct")
+# Where several estimates are valid the first of this order is pasted: consensus, static
+# background, then what only training sees.
+PASTE_ORDER = (0, 3, 4, 5, 1, 2)
+PAD_BASE = 64
+
+
+def padded_size(height: int, width: int, level: int) -> tuple[int, int]:
+    """Height and width after zero padding at a level, px: the next multiples of 64 * 2**level.
+
+    Source: the paper, 3.3 and 4.1: 270x480 to 320x512, 540x960 to 640x1024, 1080x1920 to 1280x2048.
+    """
+    multiple = PAD_BASE * 2**level
+    return -(-height // multiple) * multiple, -(-width // multiple) * multiple
+
+
+def pad(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Zero-pad (..., H, W) to `size` (height, width), the picture in the middle."""
+    extra_y, extra_x = size[0] - image.shape[-2], size[1] - image.shape[-1]
+    top, left = extra_y // 2, extra_x // 2
+    return F.pad(image, (left, extra_x - left, top, extra_y - top))
+
+
+def crop(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """The middle (..., size[0], size[1]) of an image; `crop(pad(x, s), x.shape[-2:])` is x."""
+    top, left = (image.shape[-2] - size[0]) // 2, (image.shape[-1] - size[1]) // 2
+    return image[..., top : top + size[0], left : left + size[1]]
+
+
+def convolutions(channels: list[int]) -> nn.Sequential:
+    """3x3 convolutions, each followed by a ReLU, with these numbers of channels in and between.
+
+    No normalisation layer: with a batch of one, batch statistics are those of one crop, and the
+    network is trained on crops and used on whole frames that are partly blank.
+    """
+    layers: list[nn.Module] = []
+    for num_in, num_out in zip(channels[:-1], channels[1:], strict=True):
+        layers += [nn.Conv2d(num_in, num_out, 3, padding=1), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers)
+
+
+class UNet(nn.Module):
+    """Two convolutions per scale, `depth` halvings, doubling filters, skip connections.
+
+    Source: Ronneberger, Fischer, Brox, "U-Net", MICCAI 2015, with zero padding.
+    """
+
+    def __init__(self, num_in: int, width: int, depth: int) -> None:
+        super().__init__()
+        widths = [width * 2**scale for scale in range(depth + 1)]
+        pairs = list(zip([num_in, *widths[:-1]], widths, strict=True))
+        self.down = nn.ModuleList(convolutions([a, b, b]) for a, b in pairs)
+        self.up = nn.ModuleList(nn.ConvTranspose2d(2 * a, a, 2, stride=2) for a in widths[:-1])
+        self.merge = nn.ModuleList(convolutions([2 * a, a, a]) for a in widths[:-1])
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, num_in, H, W) to (B, width, H, W); H and W are multiples of 2**depth."""
+        skips: list[Tensor] = []
+        for block in self.down:
+            features = block(F.max_pool2d(skips[-1], 2) if skips else features)
+            skips.append(features)
+        for scale in reversed(range(len(self.up))):
+            joined = torch.cat([skips[scale], self.up[scale](features)], dim=1)
+            features = self.merge[scale](joined)
+        return features
+
+
+class CompositionNet(nn.Module):
+    """Foreground and background estimates of a view to its image.
+
+    num_filters: n_f, filters of the convolutions of a stream
+    unet_width:  filters of the U-Net's first scale in units of n_f
+    depth:       halvings of the U-Net
+    head:        `direct`, three convolutions give the image (the paper); or `blend`, they give
+                 weights over the six inputs and an additive correction
+    level:       0 is the coarsest; it sets the padding
+    """
+
+    def __init__(self, num_filters: int, unet_width: int, depth: int, head: str, level: int) -> None:
+        super().__init__()
+        if head not in HEADS:
+            raise ValueError(f"head must be one of {HEADS}, got {head!r}")
+        self.level, self.head = level, head
+        stream = [STREAM_CHANNELS] + [num_filters] * 3
+        width = unet_width * num_filters
+        self.streams = nn.ModuleList(convolutions(stream) for _ in range(NUM_STREAMS))
+        self.unet = UNet(NUM_STREAMS * num_filters, width, depth)
+        num_out = 3 if head == "direct" else NUM_STREAMS + 1 + 3
+        last = nn.Conv2d(width, num_out, 3, padding=1)
+        self.output = nn.Sequential(*convolutions([width, width, width]), last)
+        self.apply(_initialize)
+        if head == "blend":
+            nn.init.zeros_(last.weight)
+
+    def forward(self, streams: Tensor) -> Tensor:
+        """(B, 6, 4, H, W) in [0, 1] to (B, 3, H, W), about [0, 1].
+
+        Streams are RGB and validity, three foreground then three background; colours are 0 where
+        validity is 0. Any H and W: the input is zero-padded and the output cropped back.
+        """
+        size = (streams.shape[-2], streams.shape[-1])
+        padded = pad(streams, padded_size(*size, self.level))
+        encoded = [stream(padded[:, i]) for i, stream in enumerate(self.streams)]
+        decoded = crop(self.output(self.unet(torch.cat(encoded, dim=1))), size)
+        return decoded if self.head == "direct" else blend(streams, decoded)
+
+
+def paste(streams: Tensor) -> Tensor:
+    """(B, 3, H, W): the first valid stream of `PASTE_ORDER`; the mean pasted colour where none is."""
+    image, filled = torch.zeros_like(streams[:, 0, :3]), torch.zeros_like(streams[:, 0, 3:])
+    for index in PASTE_ORDER:
+        colour, valid = streams[:, index, :3], streams[:, index, 3:]
+        image = torch.where(filled > 0, image, colour * valid)
+        filled = torch.maximum(filled, valid)
+    mean = image.sum(dim=(2, 3), keepdim=True) / filled.sum(dim=(2, 3), keepdim=True).clamp(min=1)
+    return torch.where(filled > 0, image, mean)
+
+
+def blend(streams: Tensor, decoded: Tensor) -> Tensor:
+    """Weighted inputs plus a correction; exactly `paste(streams)` where `decoded` is 0.
+
+    decoded: (B, 10, H, W): six logits, how far to leave the paste for their softmax over the valid
+    inputs (0 not at all, 1 entirely), and an RGB correction. A softmax alone could start at the
+    paste only saturated, where it has no gradient.
+    """
+    valid = streams[:, :, 3]
+    logits, gate, correction = decoded.split([NUM_STREAMS, 1, 3], dim=1)
+    # Subtracting the maximum over all streams keeps the exponentials in (0, 1].
+    weights = torch.exp(logits - logits.amax(dim=1, keepdim=True)) * valid
+    weights = weights / weights.sum(dim=1, keepdim=True).clamp(min=1e-12)
+    mixed = (weights.unsqueeze(2) * streams[:, :, :3]).sum(dim=1)
+    base = paste(streams)
+    any_valid = valid.amax(dim=1, keepdim=True)
+    return base + gate * any_valid * (mixed - base) + correction
+
+
+class Discriminator(nn.Module):
+    """Patches of an image to logits of being real; it sees the image only, as in equation 2.
+
+    Source: Isola et al., "Image-to-Image Translation with Conditional Adversarial Networks", 3.2.2
+    (patches), with 3 halvings and no normalisation.
+    """
+
+    def __init__(self, width: int = 16) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for num_in, num_out in ((3, width), (width, 2 * width), (2 * width, 4 * width)):
+            layers += [nn.Conv2d(num_in, num_out, 4, stride=2, padding=1), nn.LeakyReLU(0.2, inplace=True)]
+        self.patches = nn.Sequential(*layers, nn.Conv2d(4 * width, 1, 3, padding=1))
+        self.apply(_initialize)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, H, W), sides of at least 8 px, to (B, 1, H // 8, W // 8) logits."""
+        return self.patches(image)
+
+
+def _initialize(module: nn.Module) -> Any:
+    if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+        nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+        nn.init.zeros_(module.bias)  # type: ignore[arg-type]

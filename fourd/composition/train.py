@@ -1,0 +1,214 @@
+"""Fits one level's network to a scene: every input camera's own frames are its targets."""
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fourd import metrics
+from fourd.composition import CompositionOptions, data, infer, losses
+from fourd.composition.checkpoint import Checkpoint, Progress, StopRequest
+from fourd.composition.model import CompositionNet, Discriminator
+from fourd.errors import InputError
+
+log = logging.getLogger("fourd.composition")
+
+MAX_SKIPPED_IN_A_ROW = 3
+LOSSES = ("reconstruction", "frequency", "adversarial", "discriminator", "train_psnr_db")
+COLUMNS = ("epoch", "step", "seconds", *LOSSES, "validation_psnr_db", "paste_psnr_db", "skipped_steps")
+
+
+class Trainer:
+    """Networks, optimisers and counters of one level: everything that a checkpoint holds."""
+
+    def __init__(self, level: int, options: CompositionOptions, device: str) -> None:
+        if level >= len(options.num_filters):
+            raise InputError(
+                f"expected num_filters for level {level}, got {len(options.num_filters)} values "
+                f"{options.num_filters}: give one per level, coarsest first"
+            )
+        self.network_arguments: dict[str, Any] = {
+            "num_filters": options.num_filters[level],
+            "unet_width": options.unet_width,
+            "depth": options.depth,
+            "head": options.head,
+            "level": level,
+        }
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(options.seed)
+            generator, discriminator = CompositionNet(**self.network_arguments), Discriminator()
+        nhwc: Any = {"device": device, "memory_format": torch.channels_last}
+        self.generator, self.discriminator = generator.to(**nhwc), discriminator.to(**nhwc)
+        rate = options.learning_rate
+        self.generator_optimizer = torch.optim.Adam(self.generator.parameters(), lr=rate)
+        self.discriminator_optimizer = torch.optim.Adam(self.discriminator.parameters(), lr=rate)
+        self.counters: dict[str, Any] = {
+            "step": 0, "skipped": 0, "skipped_in_a_row": 0, "elapsed_s": 0.0, "rows": [], "sums": {}
+        }  # fmt: skip
+
+    def _parts(self) -> dict[str, Any]:
+        names = ("generator", "discriminator", "generator_optimizer", "discriminator_optimizer")
+        return {name: getattr(self, name) for name in names}
+
+    def state(self) -> dict[str, Any]:
+        return {name: part.state_dict() for name, part in self._parts().items()} | {"counters": self.counters}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+        self.counters = dict(state["counters"])
+
+
+def update(
+    trainer: Trainer, streams: Tensor, target: Tensor, valid: Tensor, options: CompositionOptions
+) -> tuple[dict[str, float], Tensor] | None:
+    """One step of discriminator and generator on a sample.
+
+    Arguments as `data.streams_from_images`, `data.target_from_images` give them.
+    Returns the losses, unweighted, and the generator's output; None, with the generator unchanged,
+    if a loss or a gradient is not finite.
+    """
+    generator, discriminator = trainer.generator, trainer.discriminator
+    output = generator(streams)
+    terms = {
+        "reconstruction": losses.reconstruction_loss(output, target, valid),
+        "frequency": losses.frequency_loss(output, target, valid),
+    }
+    loss = options.l1_weight * terms["reconstruction"] + options.frequency_weight * terms["frequency"]
+    if not torch.isfinite(loss):
+        return None
+    if options.adversarial_weight > 0:
+        real, fake = (torch.where(valid, image, torch.zeros_like(image)) for image in (target, output))
+        terms["discriminator"] = losses.discriminator_loss(discriminator(real), discriminator(fake.detach()))
+        if not descend(trainer.discriminator_optimizer, terms["discriminator"]):
+            return None
+        discriminator.requires_grad_(False)
+        terms["adversarial"] = losses.generator_loss(discriminator(fake))
+        discriminator.requires_grad_(True)
+        loss = loss + options.adversarial_weight * terms["adversarial"]
+    if not descend(trainer.generator_optimizer, loss):
+        return None
+    return {name: float(term.detach()) for name, term in terms.items()}, output.detach()
+
+
+def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> bool:
+    """One optimiser step; False, and no step, if the loss or a gradient is not finite."""
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    gradients = [p.grad for group in optimizer.param_groups for p in group["params"]]
+    if not all(bool(torch.isfinite(x).all()) for x in (loss, *gradients)):
+        return False
+    optimizer.step()
+    return True
+
+
+def train(
+    trainer: Trainer,
+    samples: data.SampleSet,
+    split: tuple[Sequence[data.SampleId], Sequence[data.SampleId]],
+    options: CompositionOptions,
+    save: Checkpoint,
+    stop: StopRequest,
+) -> list[dict[str, Any]]:
+    """Train until the last epoch, `max_minutes` or a request to stop.
+
+    split: the samples to train on and those kept apart
+    Returns the rows of the log. Raises SystemExit after a signal, with everything saved.
+    """
+    training, apart = split
+    counters, device = trainer.counters, next(trainer.generator.parameters()).device
+    total = options.epochs * len(training)
+    progress = Progress(total, counters["step"])
+    started = time.monotonic() - counters["elapsed_s"]
+    while counters["step"] < total and not _is_over(options.max_minutes, started):
+        step = counters["step"]
+        epoch, position = divmod(step, len(training))
+        sample = training[data.sample_order(len(training), epoch, options.seed)[position]]
+        images = data.augment(samples.images(sample), options.crop, options.max_scale, options.seed, step)
+        order = data.draw_streams(options.test_input_share, options.seed, step)
+        streams = data.streams_from_images(images, order).to(device)
+        target, valid = (tensor.to(device) for tensor in data.target_from_images(images))
+
+        result = update(trainer, streams, target, valid, options)
+        counters["step"] = step + 1
+        counters["elapsed_s"] = time.monotonic() - started
+        if result is None:
+            _count_skipped(counters, sample)
+        else:
+            counters["skipped_in_a_row"] = 0
+            terms = result[0] | {"train_psnr_db": _psnr(result[1], target, valid)}
+            for name, value in terms.items():
+                total_value, count = counters["sums"].get(name, (0.0, 0))
+                counters["sums"][name] = (total_value + value, count + 1)
+            progress.report(step + 1, epoch, options.epochs, terms)
+
+        if counters["step"] % len(training) == 0:
+            counters["rows"].append(_log_row(trainer, samples, apart, epoch + 1))
+            counters["sums"] = {}
+            save(trainer)
+        elif stop.signal_number is not None or save.is_due(options.checkpoint_s):
+            save(trainer)
+        if stop.signal_number is not None:
+            log.info("stopped by a signal at step %d of %d: run again to continue", step + 1, total)
+            raise SystemExit(128 + stop.signal_number)
+    save(trainer)
+    unfinished = counters["step"] % len(training) != 0
+    last = [_log_row(trainer, samples, apart, counters["step"] // len(training) + 1)] if unfinished else []
+    return counters["rows"] + last
+
+
+def _is_over(max_minutes: float | None, started: float) -> bool:
+    return max_minutes is not None and time.monotonic() - started >= 60 * max_minutes
+
+
+def _count_skipped(counters: dict[str, Any], sample: data.SampleId) -> None:
+    counters["skipped"] += 1
+    counters["skipped_in_a_row"] += 1
+    log.warning("step %d skipped: a loss or gradient is not finite", counters["step"])
+    if counters["skipped_in_a_row"] >= MAX_SKIPPED_IN_A_ROW:
+        raise InputError(
+            f"expected finite losses, got NaN or infinity in {MAX_SKIPPED_IN_A_ROW} steps in a row, last for "
+            f"camera {sample.cam}, frame {sample.frame}, of {sample.foreground}: lower learning_rate or the "
+            "loss weights, delete checkpoint.pt and train again"
+        )
+
+
+def _psnr(output: Tensor, target: Tensor, valid: Tensor) -> float:
+    if not bool(valid.any()):
+        return 0.0
+    difference = (output.clamp(0, 1) - target) * valid
+    mse = float(difference.square().sum() / (valid.sum() * target.shape[1]))
+    return metrics.psnr_from_mse(max(mse, 1e-10) * metrics.DATA_RANGE**2)
+
+
+def _log_row(
+    trainer: Trainer, samples: data.SampleSet, apart: Sequence[data.SampleId], epoch: int
+) -> dict[str, Any]:
+    """A row of train.csv: means over the epoch, and quality at test-time inputs on samples kept apart."""
+    counters = trainer.counters
+    row = {name: total / count for name, (total, count) in counters["sums"].items()}
+    row |= {"epoch": epoch, "step": counters["step"], "seconds": round(counters["elapsed_s"], 1)}
+    row |= {"skipped_steps": counters["skipped"]} | validate(trainer.generator, samples, apart)
+    return {name: row.get(name, "") for name in COLUMNS}
+
+
+def validate(
+    network: CompositionNet, samples: data.SampleSet, ids: Sequence[data.SampleId]
+) -> dict[str, float]:
+    """Mean PSNR, dB, of the network at test-time inputs and of the plain paste; empty without samples."""
+    rows = []
+    for sample in ids:
+        images = samples.images(sample)
+        truth, region = images[data.TARGET, ..., :3], images[data.TARGET, ..., 3] > 0
+        pair = (infer.run_network(network, images), infer.paste_images(images))
+        if region.any():
+            rows.append([metrics.psnr(image, truth, region) for image in pair])
+    if not rows:
+        return {}
+    composed, pasted = np.mean(rows, axis=0)
+    log.info("test-time inputs, %d samples: %.2f dB, pasted %.2f dB", len(rows), composed, pasted)
+    return {"validation_psnr_db": float(composed), "paste_psnr_db": float(pasted)}

@@ -1,0 +1,202 @@
+"""Compiled sampling of colours from the original images through a fused depth; one core, float32."""
+
+import numpy as np
+from numba import njit
+
+from fourd.fuse.geometry import Sources
+from fourd.fuse.options import MIN_SINE_SQUARED, MIN_WEIGHT
+
+NO_SOURCE = np.uint8(255)
+_ZERO = np.float32(0)
+_ONE = np.float32(1)
+_HALF = np.float32(0.5)
+_NEVER = np.float32(np.inf)
+_MIN_WEIGHT = np.float32(MIN_WEIGHT)
+_MIN_SINE = np.float32(MIN_SINE_SQUARED)
+
+
+def pack_sources(sources: Sources) -> np.ndarray:
+    """(C, 26) float32: A row by row (9), b (3), lens (9), distortion (5) of every camera."""
+    count = len(sources.names)
+    parts = [sources.A.reshape(count, 9), sources.b, sources.lens, sources.distortion]
+    return np.ascontiguousarray(np.concatenate(parts, axis=1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _place_row(p, v, chosen, px, py, cost):
+    """Where one source sees the points of a target row.
+
+    p: (26,) float32, a row of `pack_sources`;  v: target row;  chosen: (W,) inverse depth
+    px, py, cost: (W,) float32, changed: place in the source and the cost of using it, infinite where
+    it cannot be: behind it, outside its image, or more than 90 degrees away. No branches: this loop
+    runs in vector registers.
+    """
+    a0, a1, a2, b0, b1, b2 = p[0], p[3], p[6], p[9], p[10], p[11]
+    row0, row1, row2 = p[1] * v + p[2], p[4] * v + p[5], p[7] * v + p[8]
+    fx, skew, cx, fy, cy, far, focal_ratio = p[12], p[13], p[14], p[15], p[16], p[17], p[18]
+    right, bottom, k1, k2, p1, p2, k3 = p[19], p[20], p[21], p[22], p[23], p[24], p[25]
+    for i in range(chosen.shape[0]):
+        u, t = np.float32(i), chosen[i]
+        d0, d1, d2 = a0 * u + row0, a1 * u + row1, a2 * u + row2
+        e0, e1, e2 = t * b0, t * b1, t * b2
+        q0, q1, q2 = d0 + e0, d1 + e1, d2 + e2
+        inverse = _ONE / q2
+        x, y = q0 * inverse, q1 * inverse
+        xx, xy, yy = x * x, x * y, y * y
+        r2 = xx + yy
+        radial = _ONE + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd = x * radial + (p1 + p1) * xy + p2 * (r2 + (xx + xx))
+        yd = y * radial + p1 * (r2 + (yy + yy)) + (p2 + p2) * xy
+        at_x, at_y = fx * xd + skew * yd + cx, fy * yd + cy
+        c0, c1, c2 = e1 * d2 - e2 * d1, e2 * d0 - e0 * d2, e0 * d1 - e1 * d0
+        squares = (q0 * q0 + q1 * q1 + q2 * q2) * (d0 * d0 + d1 * d1 + d2 * d2)
+        sine_squared = (c0 * c0 + c1 * c1 + c2 * c2) / squares
+        coarser = max(focal_ratio * q2, _ONE)
+        # A pixel is an area: half of one beyond the outer centres is still the image.
+        inside = (at_x >= -_HALF) & (at_x <= right + _HALF) & (at_y >= -_HALF) & (at_y <= bottom + _HALF)
+        facing = q0 * d0 + q1 * d1 + q2 * d2 > _ZERO
+        usable = inside & facing & (q2 > _ZERO) & (r2 <= far)
+        px[i], py[i] = min(max(at_x, _ZERO), right), min(max(at_y, _ZERO), bottom)
+        cost[i] = (sine_squared + _MIN_SINE) * (coarser * coarser) if usable else _NEVER
+
+
+@njit(cache=True, nogil=True)
+def _keys(f, a):
+    """Weights of four samples at -1, 0, 1, 2 for a point at f in 0..1 (Keys 1981, equation 4)."""
+    g = _ONE - f
+    two, three = a + np.float32(2), a + np.float32(3)
+    return (
+        a * f * g * g,
+        (two * f - three) * f * f + _ONE,
+        (two * g - three) * g * g + _ONE,
+        a * g * f * f,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _mix_rows(image, at, w, r0, r1, r2, r3):
+    """Four rows of one channel of one column, weighted. Unsigned, so that no index can wrap."""
+    upper = w[0] * np.float32(image[r0 + at]) + w[1] * np.float32(image[r1 + at])
+    lower = w[2] * np.float32(image[r2 + at]) + w[3] * np.float32(image[r3 + at])
+    return upper + lower
+
+
+@njit(cache=True, nogil=True)
+def _mix_channel(image, channel, wx, wy, c0, c1, c2, c3, r0, r1, r2, r3):
+    """Sixteen samples of one channel, weighted."""
+    first = wx[0] * _mix_rows(image, c0 + channel, wy, r0, r1, r2, r3)
+    second = wx[1] * _mix_rows(image, c1 + channel, wy, r0, r1, r2, r3)
+    third = wx[2] * _mix_rows(image, c2 + channel, wy, r0, r1, r2, r3)
+    fourth = wx[3] * _mix_rows(image, c3 + channel, wy, r0, r1, r2, r3)
+    return (first + second) + (third + fourth)
+
+
+@njit(cache=True, nogil=True)
+def _sample(image, start, width, height, px, py, a):
+    """Bicubic r, g, b at (px, py) of an image that starts at `start` of a flat buffer; edges repeat."""
+    x, y = int(px), int(py)
+    wx, wy = _keys(px - np.float32(x), a), _keys(py - np.float32(y), a)
+    r0 = np.uint64(start + 3 * width * max(y - 1, 0))
+    r1 = np.uint64(start + 3 * width * y)
+    r2 = np.uint64(start + 3 * width * min(y + 1, height - 1))
+    r3 = np.uint64(start + 3 * width * min(y + 2, height - 1))
+    c0, c1 = np.uint64(3 * max(x - 1, 0)), np.uint64(3 * x)
+    c2, c3 = np.uint64(3 * min(x + 1, width - 1)), np.uint64(3 * min(x + 2, width - 1))
+    return (
+        _mix_channel(image, np.uint64(0), wx, wy, c0, c1, c2, c3, r0, r1, r2, r3),
+        _mix_channel(image, np.uint64(1), wx, wy, c0, c1, c2, c3, r0, r1, r2, r3),
+        _mix_channel(image, np.uint64(2), wx, wy, c0, c1, c2, c3, r0, r1, r2, r3),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _rank(mask, cost, x, keep, best):
+    """The `keep` cameras of a mask of least finite cost, in order. Returns their number."""
+    found = 0
+    for c in range(cost.shape[0]):
+        price = cost[c, x]
+        if ((mask >> np.uint64(c)) & np.uint64(1) == np.uint64(0)) | (price == _NEVER):
+            continue
+        i = found
+        while i > 0 and cost[best[i - 1], x] > price:
+            best[i] = best[i - 1]
+            i -= 1
+        best[i] = c
+        found = min(found + 1, keep)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _to_byte(value):
+    """Nearest of 0..255, halves to even."""
+    return np.uint8(min(max(np.rint(value), _ZERO), np.float32(255)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blend(found, num_sources, best, x, px, py, cost, params, image, starts, a):
+    """Weighted mean of the first `num_sources` of `found` ranked sources: r, g, b in 0..255."""
+    red, green, blue, weights = _ZERO, _ZERO, _ZERO, _ZERO
+    for i in range(min(found, num_sources)):
+        c = best[i]
+        w = _ONE / cost[c, x]
+        if found > num_sources:
+            w *= max(_ONE - cost[c, x] / cost[best[num_sources], x], _MIN_WEIGHT)
+        width, height = int(params[c, 19]) + 1, int(params[c, 20]) + 1
+        r, g, b = _sample(image, starts[c], width, height, px[c, x], py[c, x], a)
+        red += w * r
+        green += w * g
+        blue += w * b
+        weights += w
+    return red / weights, green / weights, blue / weights
+
+
+@njit(cache=True, nogil=True)
+def _find_twin(chosen, cameras, e, y, x):
+    """An earlier estimate with the same depth and cameras, hence the same colour; or -1."""
+    for f in range(e):
+        if chosen[f, y, x] == chosen[e, y, x] and cameras[f, y, x] == cameras[e, y, x]:
+            return f
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def sample_colours(chosen, cameras, params, image, starts, first_row, num_sources, a, rgb, source):
+    """Colours of chosen depths from the cameras that may have seen them.
+
+    chosen: (E, h, W) float32 inverse depth, blank < 0;  cameras: (E, h, W) uint64
+    params: (C, 26) float32, `pack_sources`;  image: all images as one flat uint8 buffer
+    starts: (C,) int64 where each begins;  a: Keys' parameter, float32
+    rgb: (E, h, W, 3) uint8, source: (E, h, W) uint8 camera of least cost, 255 where there is no
+    colour; both changed in place, both start as blank (0, 255)
+
+    The `num_sources` cameras of least cost are blended with weights (1 - cost / next) / cost, where
+    `next` is the cost of the best that is left out: weights are continuous where the ranking changes.
+    """
+    num_estimates, height, width = chosen.shape
+    num_cameras = params.shape[0]
+    best = np.empty(num_sources + 2, np.int64)
+    px, py, cost = (
+        np.empty((num_cameras, width), np.float32),
+        np.empty((num_cameras, width), np.float32),
+        np.empty((num_cameras, width), np.float32),
+    )
+    for e in range(num_estimates):
+        for y in range(height):
+            for c in range(num_cameras):
+                _place_row(params[c], np.float32(y + first_row), chosen[e, y], px[c], py[c], cost[c])
+            for x in range(width):
+                if chosen[e, y, x] < _ZERO:
+                    continue
+                twin = _find_twin(chosen, cameras, e, y, x)
+                if twin >= 0:
+                    source[e, y, x] = source[twin, y, x]
+                    for j in range(3):
+                        rgb[e, y, x, j] = rgb[twin, y, x, j]
+                    continue
+                found = _rank(cameras[e, y, x], cost, x, num_sources + 1, best)
+                if found == 0:
+                    continue
+                r, g, b = _blend(found, num_sources, best, x, px, py, cost, params, image, starts, a)
+                source[e, y, x] = np.uint8(best[0])
+                rgb[e, y, x, 0], rgb[e, y, x, 1] = _to_byte(r), _to_byte(g)
+                rgb[e, y, x, 2] = _to_byte(b)

@@ -1,0 +1,134 @@
+"""The whole workflow on a tiny event, called as a user calls it."""
+
+import hashlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from fourd.io import read_csv, read_json
+from fourd.video import probe_video
+from tests.conftest import REPOSITORY, Workspace, tiny_scene
+
+FILMS = ("freeze_time", "hold_view", "time_and_view")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """A workspace in which the tiny event has been rendered once."""
+    workspace = Workspace(tmp_path_factory.mktemp("tiny"))
+    workspace.write_scene("demo", tiny_scene())
+    result = workspace.snakemake("--cores", "2", "render_all")
+    assert result.returncode == 0, result.stdout[-4000:]
+    return workspace
+
+
+def results(workspace: Workspace) -> Path:
+    return workspace.folder / "results" / "demo"
+
+
+def hashes(workspace: Workspace) -> dict[str, str]:
+    """Digest of every final file; tables of run times are no results."""
+    return {
+        str(path.relative_to(results(workspace))): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(results(workspace).rglob("*"))
+        if path.suffix in (".png", ".mp4", ".json", ".pt") or path.name == "metrics.csv"
+    }
+
+
+def planned(workspace: Workspace, *arguments: str) -> set[str]:
+    """Rules that a dry run would run."""
+    output = workspace.snakemake("-n", "--quiet", "rules", "host", "render_all", *arguments).stdout
+    if "Nothing to be done" in output:
+        return set()
+    table = output.split("Job stats:")[1].split("total")[0]
+    return set(re.findall(r"^(\w+)\s+\d+$", table, re.MULTILINE)) - {"render_all"}
+
+
+def test_films_have_every_frame_at_the_right_size_and_rate(finished: Workspace) -> None:
+    for film in FILMS:
+        info = probe_video(results(finished) / "render" / f"{film}.mp4")
+        assert info.size == (96, 54)
+        assert len(info.pts_s) == 6
+        assert info.pts_s[1] - info.pts_s[0] == pytest.approx(1 / 30, abs=1e-3)
+
+
+def test_every_result_is_finite_and_complete(finished: Workspace) -> None:
+    rows = read_csv(results(finished) / "evaluate" / "metrics.csv")
+    assert {row["method"] for row in rows} >= {"ours", "inst", "paste", "nn_same_time"}
+    assert {int(row["frame"]) for row in rows} == {1, 4}
+    assert read_json(results(finished) / "sfm" / "cameras.json")["heldout"] == ["cam02"]
+
+
+def test_temporary_files_are_gone_and_none_is_half_written(finished: Workspace) -> None:
+    left = [path for path in results(finished).rglob("*") if ".tmp" in path.name]
+    assert left == []
+    assert not list(results(finished).glob("disparity/**/*.npz"))
+
+
+def test_second_run_does_nothing(finished: Workspace) -> None:
+    result = finished.snakemake("--cores", "2", "render_all")
+    assert "Nothing to be done" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("setting", "rules"),
+    [
+        ("render={crf: 30}", {"encode_film", "render_frames", "evaluate_camera", "collect_metrics"}),
+        (
+            "composition={epochs: 3}",
+            {"train_level", "render_frames", "encode_film", "evaluate_camera", "collect_metrics"},
+        ),
+        ("evaluate={ssim_sigma: 2.0}", {"evaluate_camera", "collect_metrics"}),
+    ],
+)
+def test_a_setting_runs_exactly_what_is_below_it(finished: Workspace, setting: str, rules: set[str]) -> None:
+    """Temporary inputs of a rule that runs again are made again; nothing above them is."""
+    remade = {"disparity", "fuse_foreground", "estimate_background"}
+    assert planned(finished, "--config", setting) - remade == rules
+
+
+def test_killed_run_goes_on_and_ends_with_the_same_bytes(finished: Workspace, tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path)
+    workspace.write_scene("demo", tiny_scene())
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(REPOSITORY / "Snakefile")]
+    command += ["--workflow-profile", "none", "--cores", "2", "render_all"]
+    for pause_s in (8.0, 14.0):
+        process = subprocess.Popen(
+            command,
+            cwd=workspace.folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+            env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        )
+        time.sleep(pause_s)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        # A killed engine leaves its lock; it says so and how to take it away.
+        assert workspace.snakemake("--unlock").returncode == 0
+    result = workspace.snakemake("--cores", "2", "--rerun-incomplete", "render_all")
+    assert result.returncode == 0, result.stdout[-4000:]
+    assert hashes(workspace) == hashes(finished)
+
+
+def test_truncated_footage_stops_with_a_sentence_and_keeps_finished_work(
+    finished: Workspace, tmp_path: Path
+) -> None:
+    workspace = Workspace(tmp_path)
+    scene = tiny_scene()
+    film = results(finished) / "render" / "hold_view.mp4"
+    (tmp_path / "cut.mp4").write_bytes(film.read_bytes()[:900])
+    scene["cameras"]["cam01"]["source"] = "cut.mp4"
+    workspace.write_scene("demo", scene)
+    result = workspace.snakemake("--cores", "2", "--keep-going", "--show-failed-logs", "render_all")
+    assert result.returncode != 0
+    assert "error: " in result.stdout
+    assert "cut.mp4" in result.stdout
+    assert "Traceback" not in result.stdout
+    assert (tmp_path / "results" / "demo" / "ingest" / "cam00.json").is_file()

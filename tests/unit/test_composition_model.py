@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fourd.composition import model
+from fourd.composition.model import CompositionNet, Discriminator
+
+
+def random_streams(height, width, seed=0, num=1):
+    rng = np.random.default_rng(seed)
+    rgb = rng.integers(0, 256, (num, 6, 3, height, width)) / np.float32(255)
+    valid = rng.integers(0, 2, (num, 6, 1, height, width))
+    streams = np.concatenate([rgb * valid, valid], axis=2).astype(np.float32)
+    return torch.from_numpy(streams)
+
+
+@pytest.mark.parametrize(
+    ("level", "size", "padded"),
+    [(0, (270, 480), (320, 512)), (1, (540, 960), (640, 1024)), (2, (1080, 1920), (1280, 2048))],
+)
+def test_padding_is_the_papers_at_every_level(level, size, padded):
+    assert model.padded_size(*size, level) == padded
+
+
+@pytest.mark.parametrize(("level", "num_filters"), [(0, 28), (1, 23), (2, 13)])
+@pytest.mark.parametrize("head", model.HEADS)
+def test_shapes_of_the_papers_levels(level, num_filters, head):
+    height, width = 270 * 2**level, 480 * 2**level
+    with torch.device("meta"):
+        network = CompositionNet(num_filters, 1, 4, head, level)
+        assert network(torch.empty(1, 6, 4, height, width)).shape == (1, 3, height, width)
+
+
+@given(
+    height=st.integers(1, 90), width=st.integers(1, 90), level=st.integers(0, 1), channels=st.integers(1, 3)
+)
+@settings(max_examples=30, deadline=None)
+def test_crop_undoes_pad(height, width, level, channels):
+    image = torch.arange(channels * height * width, dtype=torch.float32).reshape(channels, height, width)
+    padded = model.pad(image, model.padded_size(height, width, level))
+    assert padded.shape[-2:] == model.padded_size(height, width, level)
+    assert torch.equal(model.crop(padded, (height, width)), image)
+    assert (padded != 0).sum() == (image != 0).sum()
+
+
+def test_number_of_parameters_follows_from_the_architecture():
+    n, width, depth = 5, 10, 2
+    network = CompositionNet(n, 2, depth, "direct", 0)
+
+    def conv(num_in, num_out, side=3):
+        return num_in * num_out * side**2 + num_out
+
+    streams = 6 * (conv(4, n) + 2 * conv(n, n))
+    down = conv(6 * n, 10) + conv(10, 10) + conv(10, 20) + conv(20, 20) + conv(20, 40) + conv(40, 40)
+    up = conv(40, 20, 2) + conv(40, 20) + conv(20, 20) + conv(20, 10, 2) + conv(20, 10) + conv(10, 10)
+    output = 2 * conv(width, width) + conv(width, 3)
+    assert sum(p.numel() for p in network.parameters()) == streams + down + up + output
+
+
+def test_each_stream_sees_its_own_input_only():
+    torch.manual_seed(0)
+    network = CompositionNet(3, 1, 1, "direct", 0)
+    weights = [stream[0].weight for stream in network.streams]
+    assert len(weights) == 6
+    assert all(w.shape == (3, 4, 3, 3) for w in weights)
+    streams = random_streams(16, 16)
+    streams[:, 2] = 0
+    network(streams).sum().backward()
+    assert weights[2].grad.abs().sum() == 0
+    assert weights[1].grad.abs().sum() > 0
+
+
+def test_blend_starts_as_the_paste_exactly():
+    torch.manual_seed(0)
+    streams = random_streams(30, 40)
+    output = CompositionNet(4, 1, 2, "blend", 0)(streams)
+    consensus, background = streams[:, 0], streams[:, 3]
+    expected = torch.where(consensus[:, 3:] > 0, consensus[:, :3], background[:, :3])
+    known = ((consensus[:, 3] > 0) | (background[:, 3] > 0))[:, None].expand_as(output)
+    assert known.any()
+    assert torch.equal(output[known], expected[known])
+    assert torch.equal(output, model.paste(streams))
+
+
+def test_blend_can_leave_the_paste_from_the_first_step():
+    torch.manual_seed(0)
+    network = CompositionNet(4, 1, 2, "blend", 0)
+    network(random_streams(16, 16)).square().mean().backward()
+    gate_and_correction = network.output[-1].weight.grad[6:]
+    assert (gate_and_correction.abs().amax(dim=(1, 2, 3)) > 0).all()
+
+
+def test_blend_copies_any_valid_input_and_never_an_invalid_one():
+    streams = random_streams(8, 8)
+    decoded = torch.zeros(1, 10, 8, 8)
+    decoded[:, 4], decoded[:, 6] = 200.0, 1.0
+    output = model.blend(streams, decoded)
+    valid = streams[:, 4, 3:] > 0
+    assert torch.allclose(
+        output[valid.expand_as(output)], streams[:, 4, :3][valid.expand_as(output)], atol=1e-6
+    )
+    assert torch.isfinite(output).all()
+
+
+def test_paste_of_blank_streams_is_black_and_of_partly_blank_ones_the_mean_colour():
+    blank = torch.zeros(1, 6, 4, 4, 4)
+    assert torch.equal(model.paste(blank), torch.zeros(1, 3, 4, 4))
+    blank[0, 0, :, 0, :2] = torch.tensor([[0.2, 0.4], [0.2, 0.4], [0.2, 0.4], [1, 1]])
+    pasted = model.paste(blank)
+    assert torch.allclose(pasted[0, :, 3, 3], torch.full((3,), 0.3))
+
+
+def test_black_and_blank_are_different_inputs():
+    torch.manual_seed(0)
+    network = CompositionNet(4, 1, 2, "direct", 0)
+    black = torch.zeros(1, 6, 4, 16, 16)
+    black[:, :, 3] = 1
+    assert not torch.allclose(network(black), network(torch.zeros_like(black)))
+
+
+def test_all_holes_give_finite_output_and_gradient():
+    network = CompositionNet(4, 1, 2, "blend", 0)
+    output = network(torch.zeros(1, 6, 4, 16, 16))
+    output.square().sum().backward()
+    assert torch.isfinite(output).all()
+    assert all(torch.isfinite(p.grad).all() for p in network.parameters())
+
+
+def test_discriminator_gives_a_logit_per_patch():
+    assert Discriminator()(torch.rand(2, 3, 64, 40)).shape == (2, 1, 8, 5)
+    assert Discriminator()(torch.rand(1, 3, 8, 8)).shape == (1, 1, 1, 1)
+
+
+def test_unknown_head_is_refused():
+    with pytest.raises(ValueError, match="blend"):
+        CompositionNet(4, 1, 2, "softmax", 0)

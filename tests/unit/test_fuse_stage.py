@@ -1,0 +1,85 @@
+"""The stage `fuse` on files: contract, refusals, determinism, error messages."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from fourd.errors import InputError
+from fourd.fuse import ESTIMATES, FuseOptions
+from fourd.fuse.__main__ import main
+from fourd.io import Archive, write_json
+from tests.unit.fuse_scene import SIZE, pair_from_plane, stage_words, write_pair, write_scene
+
+
+def test_options_equal_the_schema():
+    path = Path(__file__).resolve().parents[2] / "config" / "schemas" / "fuse.schema.yaml"
+    schema = yaml.safe_load(path.read_text(encoding="utf-8"))
+    defaults = {key: entry["default"] for key, entry in schema["properties"].items()}
+    assert defaults == dataclasses.asdict(FuseOptions())
+    assert schema["additionalProperties"] is False
+
+
+def test_stage_writes_the_contract(tmp_path):
+    write_scene(tmp_path)
+    output = tmp_path / "out.npz"
+    main(["foreground", *stage_words(tmp_path), "--device", "cpu", "--output", str(output)])
+    archive = Archive(output)
+    assert archive.frames() == [0, 1]
+    keys = {f"{e}_{kind}" for e in ESTIMATES for kind in ("rgb", "valid")}
+    arrays = archive.frame(1)
+    assert set(arrays) == keys | {"depth", "support", "num_cameras", "source"}
+    height, width = SIZE[1], SIZE[0]
+    assert arrays["consensus_rgb"].shape == (height, width, 3) and arrays["consensus_rgb"].dtype == np.uint8
+    assert arrays["depth"].dtype == np.float32 and arrays["support"].dtype == np.uint8
+    assert archive.meta["cameras"] == ["cam00", "cam01", "cam02"] and len(archive.meta["pairs"]) == 3
+    assert archive.meta["frame_status"] == {"000000": "ok", "000001": "ok"}
+    assert arrays["consensus_valid"].mean() > 0.5
+
+
+def test_stage_leaves_out_pairs_with_the_target_and_refused_pairs(tmp_path):
+    cameras = write_scene(tmp_path)
+    pair = pair_from_plane(cameras, "cam00", "cam02", 4.0)
+    write_pair(tmp_path / "disparity" / "cam00-cam02.npz", pair, (), status="too wide: 91 degrees")
+    output = tmp_path / "out.npz"
+    words = stage_words(tmp_path, "cam01")
+    main(["foreground", *words, "--estimates", "consensus", "--device", "cpu", "--output", str(output)])
+    archive = Archive(output)
+    assert archive.meta["pairs"] == [] and archive.meta["cameras"] == ["cam00", "cam02"]
+    assert archive.meta["refused"]["cam00-cam02"] == "too wide: 91 degrees"
+    assert "cam01" in archive.meta["refused"]["cam00-cam01"]
+    assert archive.meta["frame_status"]["000000"] == "no usable pair"
+    arrays = archive.frame(0)
+    assert not arrays["consensus_valid"].any() and "closest_rgb" not in arrays
+
+
+def test_stage_is_deterministic_and_memory_does_not_matter(tmp_path):
+    write_scene(tmp_path)
+    for name, memory in (("a", "512"), ("b", "512"), ("c", "16")):
+        words = ["foreground", *stage_words(tmp_path), "--device", "cpu", "--memory-mb", memory]
+        main([*words, "--output", str(tmp_path / f"{name}.npz")])
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    a, c = Archive(tmp_path / "a.npz").frame(0), Archive(tmp_path / "c.npz").frame(0)
+    assert all(np.array_equal(a[key], c[key], equal_nan=key == "depth") for key in a)
+
+
+def test_stage_names_the_missing_frame(tmp_path):
+    cameras = write_scene(tmp_path)
+    pair = pair_from_plane(cameras, "cam00", "cam02", 4.0)
+    write_pair(tmp_path / "disparity" / "cam00-cam02.npz", pair, (0,))
+    output = tmp_path / "out.npz"
+    with pytest.raises(InputError, match="cam00-cam02 at scene frame 1.*frames 0 to 0"):
+        main(["foreground", *stage_words(tmp_path), "--device", "cpu", "--output", str(output)])
+    assert not output.exists() and not list(tmp_path.glob(".out*"))
+
+
+def test_stage_reports_cameras_that_are_not_calibrated(tmp_path):
+    write_scene(tmp_path)
+    document = json.loads((tmp_path / "cameras.json").read_text())
+    del document["cameras"]["cam02"]
+    write_json(tmp_path / "cameras.json", document)
+    with pytest.raises(InputError, match="cam02"):
+        main(["foreground", *stage_words(tmp_path), "--device", "cpu", "--output", str(tmp_path / "o.npz")])

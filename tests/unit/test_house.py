@@ -1,0 +1,97 @@
+"""Rules of the house that a machine can check."""
+
+import ast
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from fourd.config_docs import render_reference
+from tests.conftest import REPOSITORY
+
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 60
+MAX_RULE_LINES = 40
+
+
+def tracked(*patterns: str) -> list[Path]:
+    names = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", *patterns],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    return [REPOSITORY / name for name in names]
+
+
+def test_files_and_functions_are_small() -> None:
+    for path in tracked("*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= MAX_FILE_LINES, path
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                assert lines <= MAX_FUNCTION_LINES, f"{path}: {node.name} has {lines} lines"
+
+
+def test_rules_are_small_and_complete() -> None:
+    for path in tracked("rules/*.smk", "Snakefile"):
+        text = path.read_text(encoding="utf-8")
+        rules = re.split(r"^(?=rule \w+:)", text, flags=re.MULTILINE)[1:]
+        for rule in rules:
+            body = re.split(r"\n(?=\S)", rule)[0]
+            assert len(body.splitlines()) <= MAX_RULE_LINES, body
+            assert "run:" not in body
+            if "shell:" in body:
+                for directive in ("output:", "log:", "benchmark:", "conda:", "params:"):
+                    assert directive in body, f"{path}: no {directive} in\n{body}"
+        assert "checkpoint " not in text
+
+
+def test_environments_match_the_project() -> None:
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    pins = set(project["dependencies"]) | {
+        pin for extra in project["optional-dependencies"].values() for pin in extra
+    }
+    files = tracked("envs/*.yaml")
+    assert files
+    for path in files:
+        named = re.findall(r"^\s+- (\S+==\S+)$", path.read_text(), re.MULTILINE)
+        assert named, path
+        assert set(named) <= pins, path
+
+
+def test_every_dependency_is_pinned_and_explained() -> None:
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    explained = (REPOSITORY / "docs" / "architecture.md").read_text().lower()
+    for pin in project["dependencies"]:
+        name, version = pin.split("==")
+        assert version
+        assert name.lower() in explained, f"docs/architecture.md does not say why {name} is needed"
+
+
+def test_configuration_reference_is_current() -> None:
+    written = (REPOSITORY / "docs" / "configuration.md").read_text(encoding="utf-8")
+    assert written == render_reference(), "run `python -m fourd.config_docs`"
+
+
+@pytest.mark.parametrize("path", ["README.md", "docs/architecture.md", "docs/formats.md", "CONTRIBUTING.md"])
+def test_links_and_paths_in_the_documents_exist(path: str) -> None:
+    text = (REPOSITORY / path).read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert (REPOSITORY / path).parent.joinpath(target).exists(), f"{path} links to {target}"
+
+
+def test_every_convention_is_pinned_by_a_test() -> None:
+    lines = [
+        line
+        for line in (REPOSITORY / "docs" / "conventions.md").read_text().splitlines()
+        if line.startswith("- ")
+    ]
+    pinned = sum(
+        len(re.findall(r"def test_convention_\w+", path.read_text())) for path in tracked("tests/unit/*.py")
+    )
+    assert pinned >= len(lines)

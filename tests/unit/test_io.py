@@ -1,0 +1,112 @@
+"""Files are whole or absent, and say so."""
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from fourd import io
+from fourd.errors import InputError
+
+
+def test_atomic_path_leaves_nothing_behind_on_failure(tmp_path: Path) -> None:
+    target = tmp_path / "result.json"
+    target.write_text("old")
+    with pytest.raises(RuntimeError), io.atomic_path(target) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["result.json"]
+
+
+def test_json_round_trip_and_faults(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    io.write_json(path, {"x": [1.5, None]})
+    assert io.read_json(path) == {"schema_version": io.SCHEMA_VERSION, "x": [1.5, None]}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        io.write_json(path, {"x": float("nan")})
+    assert io.read_json(path)["x"] == [1.5, None]
+    path.write_text("{")
+    with pytest.raises(InputError, match=r"expected JSON in .*a\.json"):
+        io.read_json(path)
+    with pytest.raises(InputError, match="found nothing"):
+        io.read_json(tmp_path / "b.json")
+
+
+@settings(max_examples=25)
+@given(arrays.arrays(np.float32, arrays.array_shapes(max_dims=3, max_side=5)))
+def test_archive_round_trip(tmp_path_factory: pytest.TempPathFactory, array: np.ndarray) -> None:
+    path = tmp_path_factory.mktemp("archive") / "a.npz"
+    with io.ArchiveWriter(path, {"view": "cam00"}) as archive:
+        archive.add_frame(12, depth=array)
+        archive.add_frame(3, depth=array)
+    opened = io.Archive(path)
+    assert opened.meta["view"] == "cam00"
+    assert opened.frames() == [3, 12]
+    np.testing.assert_array_equal(opened.frame(12)["depth"], array)
+    with np.load(path) as loaded:
+        np.testing.assert_array_equal(loaded["000003/depth"], array)
+
+
+def test_archive_bytes_depend_on_content_only(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        with io.ArchiveWriter(tmp_path / f"{name}.npz") as archive:
+            archive.add("x", np.arange(5))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_cut_archive_is_refused_with_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "cut.npz"
+    with io.ArchiveWriter(path) as archive:
+        archive.add("x", np.arange(1000))
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"whole archive .*cut\.npz.*delete the file"):
+        io.Archive(path)
+
+
+def test_image_round_trip_is_rgb(tmp_path: Path) -> None:
+    image = np.zeros((4, 6, 3), np.uint8)
+    image[..., 0] = 200
+    io.write_png(tmp_path / "red.png", image)
+    np.testing.assert_array_equal(io.read_image(tmp_path / "red.png"), image)
+    (tmp_path / "no.png").write_text("text")
+    with pytest.raises(InputError, match="can be decoded"):
+        io.read_image(tmp_path / "no.png")
+
+
+def test_full_disk_is_a_sentence_and_keeps_what_was_there(tmp_path: Path) -> None:
+    """A limit on file size fails a write half way, as a full disk does."""
+    program = (
+        "import numpy as np, sys\n"
+        "from fourd import io\n"
+        "from fourd.cli import run_stage\n"
+        "def main(argv):\n"
+        "    with io.ArchiveWriter(argv[0]) as archive:\n"
+        "        archive.add('x', np.zeros(1_000_000))\n"
+        "sys.exit(run_stage(main, sys.argv[1:]))\n"
+    )
+    target = tmp_path / "big.npz"
+    target.write_text("finished work")
+
+    def limit_file_size() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+
+    result = subprocess.run(
+        [sys.executable, "-c", program, str(target)],
+        preexec_fn=limit_file_size,
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[2],
+    )
+    assert result.returncode == 3
+    assert "Traceback" not in result.stderr
+    assert "big.npz" in result.stderr
+    assert target.read_text() == "finished work"
+    assert os.listdir(tmp_path) == ["big.npz"]
