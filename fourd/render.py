@@ -8,7 +8,6 @@ import argparse
 import contextlib
 import dataclasses
 import logging
-import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -20,7 +19,7 @@ import numpy as np
 from fourd import cli
 from fourd.composition import CascadeOptions
 from fourd.errors import InputError
-from fourd.io import Archive, read_image, write_csv, write_png
+from fourd.io import Archive, atomic_folder, read_image, write_csv, write_png
 from fourd.views import read_view
 
 STAGE_VERSION = 1
@@ -80,24 +79,6 @@ def with_progress(items: Sequence[ItemT], what: str) -> Iterator[ItemT]:
             last = now
 
 
-@contextlib.contextmanager
-def atomic_directory(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; it takes the place of `path` when the block succeeds."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    # One job writes a folder, so what lies here was left by a job that was killed.
-    if temporary.is_dir():
-        shutil.rmtree(temporary)
-    temporary.mkdir()
-    try:
-        yield temporary
-        if path.is_dir():
-            shutil.rmtree(path)
-        temporary.rename(path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
 def choose_device(name: str) -> str:
     """`auto` is the first CUDA device that works, else the CPU. Raises InputError for one that does not."""
     import torch
@@ -139,7 +120,7 @@ def run_frames(
         _check_same_view(view.name, (foreground, background))
         backgrounds = BackgroundReader(background, ("farthest_rgb", "farthest_valid"))
         rows = []
-        with atomic_directory(output) as folder:
+        with atomic_folder(output) as folder:
             for frame in with_progress(frames, f"render {view.name}"):
                 consensus = read_arrays(foreground, frame, ("consensus_rgb", "consensus_valid"))
                 _check_size(view.size, consensus["consensus_rgb"], foreground_path)

@@ -27,7 +27,7 @@ rule estimate_background:
     threads: 1
     params:
         frames=lambda wildcards: frames_of_view(wildcards.view, wildcards.chunk),
-        options=options("background"),
+        options=" ".join([options("fuse"), options("background")]),
         version=fourd_config.stage_version("background"),
     shell:
         "python -m fourd.background --view-file {input.view} --cameras {input.cameras}"

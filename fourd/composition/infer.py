@@ -72,7 +72,9 @@ def paste_images(images: np.ndarray) -> np.ndarray:
 
     images: as for `run_network`
     """
-    return _image(paste_streams(streams_from_images(images, TEST_STREAMS)))
+    image, filled = paste_streams(streams_from_images(images, TEST_STREAMS))
+    mean = image.sum(dim=(2, 3), keepdim=True) / filled.sum(dim=(2, 3), keepdim=True).clamp(min=1)
+    return _image(torch.where(filled > 0, image, mean))
 
 
 def paste(foreground: Arrays, background: Arrays) -> np.ndarray:

@@ -116,19 +116,38 @@ class CompositionNet(nn.Module):
         return decoded if self.head == "direct" else blend(streams, decoded)
 
 
-def paste(streams: Tensor) -> Tensor:
-    """(B, 3, H, W): the first valid stream of `PASTE_ORDER`; the mean pasted colour where none is."""
+def paste(streams: Tensor) -> tuple[Tensor, Tensor]:
+    """The first valid stream of `PASTE_ORDER` per pixel.
+
+    Returns (B, 3, H, W), 0 where none is valid, and (B, 1, H, W), 1 where one is, else 0.
+    """
     image, filled = torch.zeros_like(streams[:, 0, :3]), torch.zeros_like(streams[:, 0, 3:])
     for index in PASTE_ORDER:
         colour, valid = streams[:, index, :3], streams[:, index, 3:]
         image = torch.where(filled > 0, image, colour * valid)
         filled = torch.maximum(filled, valid)
-    mean = image.sum(dim=(2, 3), keepdim=True) / filled.sum(dim=(2, 3), keepdim=True).clamp(min=1)
-    return torch.where(filled > 0, image, mean)
+    return image, filled
+
+
+def fill_blanks(image: Tensor, filled: Tensor) -> Tensor:
+    """Blank pixels smoothly continued from around them; the others are kept exactly.
+
+    image: (B, 3, H, W), 0 where blank;  filled: (B, 1, H, W), 1 or 0, in between on coarser scales
+    Source: Gortler et al., "The Lumigraph", 1996, 3.4.1 (pull-push).
+    """
+    height, width = image.shape[-2:]
+    if max(height, width) == 1:
+        return image / filled.clamp(min=1e-12)
+    stacked = F.pad(torch.cat([image, filled], dim=1), (0, width % 2, 0, height % 2))
+    total = 4 * F.avg_pool2d(stacked, 2)
+    coarse = total / total[:, 3:].clamp(min=1)
+    around = fill_blanks(coarse[:, :3], coarse[:, 3:])
+    finer = F.interpolate(around, scale_factor=2, mode="bilinear")[..., :height, :width]
+    return image + (1 - filled) * finer
 
 
 def blend(streams: Tensor, decoded: Tensor) -> Tensor:
-    """Weighted inputs plus a correction; exactly `paste(streams)` where `decoded` is 0.
+    """Weighted inputs plus a correction; where `decoded` is 0 exactly the paste, its blanks filled.
 
     decoded: (B, 10, H, W): six logits, how far to leave the paste for their softmax over the valid
     inputs (0 not at all, 1 entirely), and an RGB correction. A softmax alone could start at the
@@ -140,9 +159,9 @@ def blend(streams: Tensor, decoded: Tensor) -> Tensor:
     weights = torch.exp(logits - logits.amax(dim=1, keepdim=True)) * valid
     weights = weights / weights.sum(dim=1, keepdim=True).clamp(min=1e-12)
     mixed = (weights.unsqueeze(2) * streams[:, :, :3]).sum(dim=1)
-    base = paste(streams)
-    any_valid = valid.amax(dim=1, keepdim=True)
-    return base + gate * any_valid * (mixed - base) + correction
+    image, filled = paste(streams)
+    base = fill_blanks(image, filled)
+    return base + gate * filled * (mixed - base) + correction
 
 
 class Discriminator(nn.Module):

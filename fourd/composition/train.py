@@ -211,4 +211,6 @@ def validate(
         return {}
     composed, pasted = np.mean(rows, axis=0)
     log.info("test-time inputs, %d samples: %.2f dB, pasted %.2f dB", len(rows), composed, pasted)
+    if composed < pasted:
+        log.warning("the network is worse than pasting consensus over background: train longer")
     return {"validation_psnr_db": float(composed), "paste_psnr_db": float(pasted)}

@@ -1,11 +1,8 @@
 """Everything that is known about the event: cameras, depth, labels, clocks, a frozen-time orbit."""
 
-import contextlib
 import dataclasses
 import logging
-import os
-import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from fourd.camera import Camera
@@ -16,28 +13,11 @@ from fourd.demo.phones import CLAP_POSITION, SOUND_M_S, clap_times, make_phone
 from fourd.demo.place import MIRROR_CENTER, MIRROR_RADIUS, PARASOL, SUN
 from fourd.demo.render import FrozenScene
 from fourd.errors import InputError
-from fourd.io import ArchiveWriter, write_json, write_png
+from fourd.io import ArchiveWriter, atomic_folder, write_json, write_png
 
 log = logging.getLogger(__name__)
 
 PARTS = ("phones", "depth", "labels", "orbit", "scene")
-
-
-@contextlib.contextmanager
-def whole_folder(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary folder beside `path` that takes its place when the block succeeds."""
-    final = Path(path)
-    final.parent.mkdir(parents=True, exist_ok=True)
-    temporary = final.with_name(f".{final.name}.tmp{os.getpid()}")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
-    try:
-        yield temporary
-        if final.exists():
-            shutil.rmtree(final)
-        temporary.rename(final)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def write_camera_frames(
@@ -47,11 +27,21 @@ def write_camera_frames(
 
     without: labels left out of the scene, with their shadows
     """
-    with whole_folder(output) as folder:
+    with atomic_folder(output) as folder:
         for frame, time_s in enumerate(clip_times(options)):
             scene = FrozenScene(float(time_s), options, without)
             write_png(folder / f"{frame:06d}.png", scene.render(camera_at(name, float(time_s), options))[0])
             log.info("%s: frame %d of %d", name, frame + 1, options.num_frames)
+
+
+def write_camera_labels(
+    output: Path | str, name: str, options: DemoOptions, without: Sequence[int] = ()
+) -> None:
+    """Write what moves in the synchronised frames of one camera to OUTPUT/000000.png ... (0 static)."""
+    with atomic_folder(output) as folder:
+        for frame, time_s in enumerate(clip_times(options)):
+            scene = FrozenScene(float(time_s), options, without)
+            write_png(folder / f"{frame:06d}.png", scene.trace(camera_at(name, float(time_s), options))[1])
 
 
 def write_cameras(output: Path | str, options: DemoOptions) -> None:
@@ -113,7 +103,7 @@ def _write_maps(
 def _write_orbit(folder: Path, options: DemoOptions, without: Sequence[int]) -> None:
     scene = FrozenScene(middle_time(options), options, without)
     cameras = orbit_cameras(options)
-    with whole_folder(folder / "orbit") as orbit:
+    with atomic_folder(folder / "orbit") as orbit:
         for view, camera in enumerate(cameras):
             write_png(orbit / f"{view:06d}.png", scene.render(camera)[0])
             log.info("orbit: view %d of %d", view + 1, len(cameras))

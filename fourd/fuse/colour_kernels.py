@@ -23,11 +23,11 @@ def pack_sources(sources: Sources) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _place_row(p, v, chosen, px, py, cost):
-    """Where one source sees the points of a target row.
+def _place_row(p, v, us, ts, px, py, cost):
+    """Where one source sees some points of a target row.
 
-    p: (26,) float32, a row of `pack_sources`;  v: target row;  chosen: (W,) inverse depth
-    px, py, cost: (W,) float32, changed: place in the source and the cost of using it, infinite where
+    p: (26,) float32, a row of `pack_sources`;  v: target row;  us, ts: (N,) column, inverse depth
+    px, py, cost: (N,) float32, changed: place in the source and the cost of using it, infinite where
     it cannot be: behind it, outside its image, or more than 90 degrees away. No branches: this loop
     runs in vector registers.
     """
@@ -35,8 +35,8 @@ def _place_row(p, v, chosen, px, py, cost):
     row0, row1, row2 = p[1] * v + p[2], p[4] * v + p[5], p[7] * v + p[8]
     fx, skew, cx, fy, cy, far, focal_ratio = p[12], p[13], p[14], p[15], p[16], p[17], p[18]
     right, bottom, k1, k2, p1, p2, k3 = p[19], p[20], p[21], p[22], p[23], p[24], p[25]
-    for i in range(chosen.shape[0]):
-        u, t = np.float32(i), chosen[i]
+    for i in range(us.shape[0]):
+        u, t = us[i], ts[i]
         d0, d1, d2 = a0 * u + row0, a1 * u + row1, a2 * u + row2
         e0, e1, e2 = t * b0, t * b1, t * b2
         q0, q1, q2 = d0 + e0, d1 + e1, d2 + e2
@@ -151,12 +151,26 @@ def _blend(found, num_sources, best, x, px, py, cost, params, image, starts, a):
 
 
 @njit(cache=True, nogil=True)
-def _find_twin(chosen, cameras, e, y, x):
-    """An earlier estimate with the same depth and cameras, hence the same colour; or -1."""
-    for f in range(e):
-        if chosen[f, y, x] == chosen[e, y, x] and cameras[f, y, x] == cameras[e, y, x]:
-            return f
-    return -1
+def _collect_points(chosen, cameras, e, y, us, ts, twins):
+    """Points of a row that need a colour of their own, into us, ts. Returns their number.
+
+    twins: (W,) int64, changed: an earlier estimate with the same depth and cameras, hence the same
+    colour; -1 for a point that was collected, -2 for a blank
+    """
+    count = 0
+    for x in range(chosen.shape[2]):
+        twins[x] = -2
+        if chosen[e, y, x] < _ZERO:
+            continue
+        twins[x] = -1
+        for f in range(e):
+            if chosen[f, y, x] == chosen[e, y, x] and cameras[f, y, x] == cameras[e, y, x]:
+                twins[x] = f
+                break
+        if twins[x] == -1:
+            us[count], ts[count] = np.float32(x), chosen[e, y, x]
+            count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)
@@ -175,28 +189,30 @@ def sample_colours(chosen, cameras, params, image, starts, first_row, num_source
     num_estimates, height, width = chosen.shape
     num_cameras = params.shape[0]
     best = np.empty(num_sources + 2, np.int64)
-    px, py, cost = (
-        np.empty((num_cameras, width), np.float32),
-        np.empty((num_cameras, width), np.float32),
-        np.empty((num_cameras, width), np.float32),
-    )
+    twins = np.empty(width, np.int64)
+    us, ts = np.empty(width, np.float32), np.empty(width, np.float32)
+    px = np.empty((num_cameras, width), np.float32)
+    py, cost = np.empty_like(px), np.empty_like(px)
     for e in range(num_estimates):
         for y in range(height):
+            count = _collect_points(chosen, cameras, e, y, us, ts, twins)
+            v = np.float32(y + first_row)
             for c in range(num_cameras):
-                _place_row(params[c], np.float32(y + first_row), chosen[e, y], px[c], py[c], cost[c])
+                _place_row(params[c], v, us[:count], ts[:count], px[c], py[c], cost[c])
+            i = -1
             for x in range(width):
-                if chosen[e, y, x] < _ZERO:
+                if twins[x] == -2:
                     continue
-                twin = _find_twin(chosen, cameras, e, y, x)
-                if twin >= 0:
-                    source[e, y, x] = source[twin, y, x]
+                if twins[x] >= 0:
+                    source[e, y, x] = source[twins[x], y, x]
                     for j in range(3):
-                        rgb[e, y, x, j] = rgb[twin, y, x, j]
+                        rgb[e, y, x, j] = rgb[twins[x], y, x, j]
                     continue
-                found = _rank(cameras[e, y, x], cost, x, num_sources + 1, best)
+                i += 1
+                found = _rank(cameras[e, y, x], cost, i, num_sources + 1, best)
                 if found == 0:
                     continue
-                r, g, b = _blend(found, num_sources, best, x, px, py, cost, params, image, starts, a)
+                r, g, b = _blend(found, num_sources, best, i, px, py, cost, params, image, starts, a)
                 source[e, y, x] = np.uint8(best[0])
                 rgb[e, y, x, 0], rgb[e, y, x, 1] = _to_byte(r), _to_byte(g)
                 rgb[e, y, x, 2] = _to_byte(b)

@@ -1,37 +1,54 @@
 """The compiled kernels behind the interface that `view.py` uses."""
 
+import threading
+
 import numpy as np
 
 from fourd.fuse import colour_kernels, kernels
 from fourd.fuse.geometry import DisparityMap, Sources, source_rows
 from fourd.fuse.options import KEYS_A, FuseOptions, FusionRules
 
+_kept = threading.local()
+
+
+def _scratch(name: str, shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    """An array with any content that the next call with this name overwrites; one set per thread.
+
+    The system hands out new memory page by page, and that takes as long as the work done on it.
+    """
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    held = getattr(_kept, name, None)
+    if held is None or held.nbytes < size:
+        held = np.empty(size, np.uint8)
+        setattr(_kept, name, held)
+    return held[:size].view(dtype).reshape(shape)
+
 
 class CpuBackend:
-    """Projection, reduction and colours on one core; arrays in and out are numpy's."""
+    """Projection, reduction and colours on one core. Arrays that it returns last until the next call."""
 
-    def __init__(self, sources: Sources, options: FuseOptions, height: int) -> None:
+    def __init__(
+        self, sources: Sources, options: FuseOptions, size: tuple[int, int], num_pairs: int, rows: int
+    ) -> None:
+        """size: (width, height) of the target;  rows: of the highest tile."""
         self._params = colour_kernels.pack_sources(sources)
         self._options = options
-        self._height = height
-        sizes = [image.size for image in sources.images]
-        self._starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+        self._height = size[1]
+        lengths = [image.size for image in sources.images]
+        self._starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
         self._pixels = np.concatenate([image.ravel() for image in sources.images])
+        self._layers = _scratch("layers", (2, num_pairs, rows, size[0]), np.float32)
+        self._keys = _scratch("keys", (2, rows, size[0]), np.uint64)
 
-    def layer(
-        self, maps: tuple[DisparityMap, DisparityMap], rows: tuple[int, int], width: int
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """(h, W) float32 inverse depth and sigma of one pair on rows [first, last); points used."""
-        shape = (rows[1] - rows[0], width)
-        planes, points = [], 0
-        for disparity_map in maps:
-            keys = np.zeros(shape, np.uint64)
-            points += self._splat(disparity_map, rows, keys)
-            planes.append(keys)
-        inverse_depth, sigma = np.empty(shape, np.float32), np.empty(shape, np.float32)
-        tolerance = np.float32(self._options.tolerance)
-        kernels.merge_maps(planes[0], planes[1], tolerance, inverse_depth, sigma)
-        return inverse_depth, sigma, points
+    def layer(self, index: int, maps: tuple[DisparityMap, DisparityMap], rows: tuple[int, int]) -> int:
+        """Project pair `index` into rows [first, last) of the cost volume. Returns the points used."""
+        height = rows[1] - rows[0]
+        keys = self._keys[:, :height]
+        keys[:] = 0
+        points = sum(self._splat(maps[side], rows, keys[side]) for side in (0, 1))
+        inverse_depth, sigma = self._layers[:, index, :height]
+        kernels.merge_maps(keys[0], keys[1], np.float32(self._options.tolerance), inverse_depth, sigma)
+        return points
 
     def _splat(self, m: DisparityMap, rows: tuple[int, int], keys: np.ndarray) -> int:
         scalars = np.array([m.disparity_at_infinity, m.inverse_depth_per_px, m.sigma_px], np.float32)
@@ -41,15 +58,14 @@ class CpuBackend:
         )  # fmt: skip
 
     def reduce(
-        self, layers: list[tuple[np.ndarray, np.ndarray]], masks: np.ndarray, rules: FusionRules
+        self, masks: np.ndarray, rules: FusionRules, rows: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Chosen inverse depth (4, h, W), cameras (4, h, W) uint64 and counts (2, h, W) uint8."""
-        inverse_depths = np.stack([layer[0] for layer in layers])
-        sigmas = np.stack([layer[1] for layer in layers])
+        inverse_depths, sigmas = self._layers[:, :, : rows[1] - rows[0]]
         shape = inverse_depths.shape[1:]
-        chosen = np.empty((4, *shape), np.float32)
-        cameras = np.empty((4, *shape), np.uint64)
-        counts = np.empty((2, *shape), np.uint8)
+        chosen = _scratch("chosen", (4, *shape), np.float32)
+        cameras = _scratch("cameras", (4, *shape), np.uint64)
+        counts = _scratch("counts", (2, *shape), np.uint8)
         kernels.reduce_layers(
             inverse_depths, sigmas, masks, np.float32(rules.tolerance), np.float32(rules.max_front),
             rules.numbers(), rules.wanted(), chosen, cameras, counts,
@@ -60,8 +76,10 @@ class CpuBackend:
         self, chosen: np.ndarray, cameras: np.ndarray, first_row: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """(4, h, W, 3) uint8 RGB and (4, h, W) uint8 camera that weighs most, 255 = none."""
-        rgb = np.zeros((*chosen.shape, 3), np.uint8)
-        source = np.full(chosen.shape, colour_kernels.NO_SOURCE, np.uint8)
+        rgb = _scratch("rgb", (*chosen.shape, 3), np.uint8)
+        source = _scratch("source", chosen.shape, np.uint8)
+        rgb[:] = 0
+        source[:] = colour_kernels.NO_SOURCE
         colour_kernels.sample_colours(
             chosen, cameras, self._params, self._pixels, self._starts, first_row,
             self._options.num_sources, np.float32(KEYS_A), rgb, source,

@@ -140,7 +140,8 @@ class Pictures:
         self._scene = scene
         self._readers: dict[str, FrameReader] = {}
         for entry in ingest:
-            name, _, path = entry.rpartition("=")
+            # A path may hold an equals sign too.
+            name, _, path = ("", "", entry) if Path(entry).exists() else entry.partition("=")
             reader = open_camera(path)
             name = name or reader.camera
             if name != exclude:

@@ -233,14 +233,19 @@ def _gather_sorted(inverse_depths, sigmas, y, x, t, sigma, pair):
 
 
 @njit(cache=True, nogil=True)
+def _agree(t, sigma, i, j, squared):
+    """Whether two samples differ by no more than the tolerance, squared, times their variance."""
+    difference = t[j] - t[i]
+    return difference * difference <= squared * (sigma[i] * sigma[i] + sigma[j] * sigma[j])
+
+
+@njit(cache=True, nogil=True)
 def _support(t, sigma, pair, count, index, squared, masks):
     """Samples that agree with one: how many, how many of them are closer, the cameras of their pairs."""
     number = closer = 0
     cameras = np.uint64(0)
-    variance = sigma[index] * sigma[index]
     for j in range(count):
-        difference = t[j] - t[index]
-        if difference * difference <= squared * (variance + sigma[j] * sigma[j]):
+        if _agree(t, sigma, index, j, squared):
             number += 1
             closer += j < index
             cameras |= masks[pair[j]]
@@ -262,24 +267,25 @@ def _fused(t, sigma, count, index, squared):
     total, weights = _ZERO, _ZERO
     variance = sigma[index] * sigma[index]
     for j in range(count):
-        difference = t[j] - t[index]
-        spread = sigma[j] * sigma[j]
-        if difference * difference <= squared * (variance + spread):
-            weight = variance / spread
-            total += weight * difference
+        if _agree(t, sigma, index, j, squared):
+            weight = variance / (sigma[j] * sigma[j])
+            total += weight * (t[j] - t[index])
             weights += weight
     return max(t[index] + total / weights, _ZERO)
 
 
 @njit(cache=True, nogil=True)
 def _find_consensus(t, sigma, pair, count, squared, max_front, rules, masks):
-    """The closest sample that enough pairs and cameras support; -1 if there is none or it is hidden."""
-    for i in range(count):
+    """The closest sample that enough pairs and cameras support, -1 if there is none or it is hidden.
+
+    Returns its index, the number of pairs and their cameras.
+    """
+    for i in range(count if count >= rules[0] else 0):
         number, closer, cameras = _support(t, sigma, pair, count, i, squared, masks)
         if number >= rules[0] and _num_bits(cameras) >= rules[1]:
             in_front = np.float32(i - closer)
-            return -1 if in_front > max_front * np.float32(number) else i
-    return -1
+            return (-1 if in_front > max_front * np.float32(number) else i), number, cameras
+    return -1, 0, np.uint64(0)
 
 
 @njit(cache=True, nogil=True)
@@ -303,12 +309,14 @@ def reduce_layers(
     rules: (3,) int64 min_pairs, min_cameras, pairs that the farthest needs
     chosen: (4, h, W) float32 inverse depth;  cameras: (4, h, W) uint64 of the pairs that agree with it
     counts: (2, h, W) uint8 pairs and distinct cameras of the consensus (0 = blank); all three changed
+
+    A sample that agrees with the consensus is a measurement of the same surface, so closest, median
+    and farthest take the consensus' depth and cameras there. Elsewhere they are the sample itself.
     """
     num_pairs, height, width = inverse_depths.shape
     t, sigma = np.empty(num_pairs, np.float32), np.empty(num_pairs, np.float32)
     pair = np.empty(num_pairs, np.int64)
     squared = tolerance * tolerance
-    picks = np.empty(4, np.int64)
     for y in range(height):
         for x in range(width):
             count = _gather_sorted(inverse_depths, sigmas, y, x, t, sigma, pair)
@@ -318,19 +326,23 @@ def reduce_layers(
             counts[0, y, x] = counts[1, y, x] = np.uint8(0)
             if count == 0:
                 continue
-            picks[0], picks[1], picks[2], picks[3] = -1, 0, (count - 1) // 2, -1
-            if wanted[0] and count >= rules[0]:
-                picks[0] = _find_consensus(t, sigma, pair, count, squared, max_front, rules, masks)
-            if wanted[3]:
-                picks[3] = _find_farthest(t, sigma, pair, count, squared, rules, masks)
-            for e in range(4):
-                index = picks[e]
-                if index < 0 or not wanted[e]:
+            seed, number, shared_mask = _find_consensus(
+                t, sigma, pair, count, squared, max_front, rules, masks
+            )
+            shared = BLANK
+            if seed >= 0:
+                shared = _fused(t, sigma, count, seed, squared)
+                if wanted[0]:
+                    chosen[0, y, x], cameras[0, y, x] = shared, shared_mask
+                    counts[0, y, x], counts[1, y, x] = np.uint8(min(number, 255)), _num_bits(shared_mask)
+            for e in range(1, 4):
+                if not wanted[e]:
                     continue
-                number, _, mask = _support(t, sigma, pair, count, index, squared, masks)
-                chosen[e, y, x] = t[index]
-                cameras[e, y, x] = mask
-                if e == 0:
-                    chosen[e, y, x] = _fused(t, sigma, count, index, squared)
-                    counts[0, y, x] = np.uint8(min(number, 255))
-                    counts[1, y, x] = np.uint8(_num_bits(mask))
+                index = 0 if e == 1 else (count - 1) // 2
+                if e == 3:
+                    index = _find_farthest(t, sigma, pair, count, squared, rules, masks)
+                if seed >= 0 and _agree(t, sigma, index, seed, squared):
+                    chosen[e, y, x], cameras[e, y, x] = shared, shared_mask
+                else:
+                    chosen[e, y, x] = t[index]
+                    cameras[e, y, x] = _support(t, sigma, pair, count, index, squared, masks)[2]

@@ -41,7 +41,7 @@ class FuseOptions:
     memory_mb: bound for the cost volume of a tile and the disparities kept, each
     """
 
-    tolerance: float = 2.0
+    tolerance: float = 3.0
     min_pairs: int = 3
     min_cameras: int = 2
     max_front: float = 0.4

@@ -31,14 +31,17 @@ Samples = dict[tuple[int, int], Sample]
 class ReferenceBackend:
     """Same interface as `cpu.CpuBackend`."""
 
-    def __init__(self, sources: Sources, options: FuseOptions, height: int) -> None:
+    def __init__(
+        self, sources: Sources, options: FuseOptions, size: tuple[int, int], num_pairs: int, rows: int
+    ) -> None:
         self._sources = sources
         self._options = options
+        self._width = size[0]
+        self._layers: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
-    def layer(
-        self, maps: tuple[DisparityMap, DisparityMap], rows: tuple[int, int], width: int
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """(h, W) inverse depth (blank -1) and sigma of one pair; number of points."""
+    def layer(self, index: int, maps: tuple[DisparityMap, DisparityMap], rows: tuple[int, int]) -> int:
+        """As `cpu.CpuBackend.layer`."""
+        width = self._width
         footprint = F(self._options.footprint)
         planes = []
         points = 0
@@ -51,12 +54,14 @@ class ReferenceBackend:
         for pixel in planes[0].keys() | planes[1].keys():
             merged = merge(planes[0].get(pixel), planes[1].get(pixel), F(self._options.tolerance))
             inverse_depth[pixel], sigma[pixel] = merged
-        return inverse_depth, sigma, points
+        self._layers[index] = inverse_depth, sigma
+        return points
 
     def reduce(
-        self, layers: list[tuple[np.ndarray, np.ndarray]], masks: np.ndarray, rules: FusionRules
+        self, masks: np.ndarray, rules: FusionRules, rows: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Chosen inverse depth, cameras and counts, as `cpu.CpuBackend.reduce`."""
+        layers = [self._layers[i] for i in range(len(masks))]
         shape = layers[0][0].shape
         chosen = np.full((4, *shape), F(-1))
         cameras = np.zeros((4, *shape), np.uint64)
@@ -204,28 +209,26 @@ def reduce_pixel(
             mask |= samples[j][2]
         return mask
 
-    def plain(i: int) -> tuple[Scalar, int, int]:
-        members = supporters(i)
-        return samples[i][0], cameras(members), len(members)
-
     result: list[tuple[Scalar, int, int]] = [(F(-1), 0, 0)] * 4
     if not samples:
         return result
-    wanted = rules.wanted()
+    consensus, surface = result[0], []
     for i in range(len(samples)):
         members = supporters(i)
         if len(members) >= rules.min_pairs and cameras(members).bit_count() >= rules.min_cameras:
             in_front = sum(1 for j in range(i) if j not in members)
-            if wanted[0] and not F(in_front) > F(rules.max_front) * F(len(members)):
-                result[0] = _mean(samples, i, members), cameras(members), len(members)
+            if not F(in_front) > F(rules.max_front) * F(len(members)):
+                consensus, surface = (_mean(samples, i, members), cameras(members), len(members)), members
             break
-    if wanted[1]:
-        result[1] = plain(0)
-    if wanted[2]:
-        result[2] = plain((len(samples) - 1) // 2)
-    if wanted[3]:
-        far = [i for i in range(len(samples)) if len(supporters(i)) >= rules.farthest_min_pairs]
-        result[3] = plain(far[-1] if far else len(samples) - 1)
+    far = [i for i in range(len(samples)) if len(supporters(i)) >= rules.farthest_min_pairs]
+    picks = [0, (len(samples) - 1) // 2, far[-1] if far else len(samples) - 1]
+    wanted = rules.wanted()
+    if wanted[0]:
+        result[0] = consensus
+    for e, i in enumerate(picks, start=1):
+        if wanted[e]:
+            members = supporters(i)
+            result[e] = consensus if i in surface else (samples[i][0], cameras(members), len(members))
     return result
 
 

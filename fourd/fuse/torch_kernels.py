@@ -28,9 +28,19 @@ _COLOUR_BATCH = 1 << 18
 class TorchBackend:
     """Same interface as `cpu.CpuBackend`; the layers stay on the device, results come back as numpy."""
 
-    def __init__(self, sources: Sources, options: FuseOptions, height: int, device: str) -> None:
+    def __init__(
+        self,
+        sources: Sources,
+        options: FuseOptions,
+        size: tuple[int, int],
+        num_pairs: int,
+        rows: int,
+        device: str,
+    ) -> None:
         self._options = options
         self._device = torch.device(device)
+        self._width = size[0]
+        self._layers = torch.empty((2, num_pairs, rows, size[0]), device=self._device)
         self._sources = [
             {
                 "A": sources.A[c].tolist(),
@@ -45,24 +55,24 @@ class TorchBackend:
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
 
-    def layer(
-        self, maps: tuple[DisparityMap, DisparityMap], rows: tuple[int, int], width: int
-    ) -> tuple[torch.Tensor, torch.Tensor, int]:
-        """(h, W) inverse depth (blank -1) and sigma of one pair, on the device; number of points."""
+    def layer(self, index: int, maps: tuple[DisparityMap, DisparityMap], rows: tuple[int, int]) -> int:
+        """As `cpu.CpuBackend.layer`; the cost volume stays on the device."""
         footprint = _round(self._options.footprint)
         planes, points = [], 0
         for m in maps:
             patches, used = _project(m, self._tensor(m.disparity), self._tensor(m.confidence), footprint)
-            planes.append(_splat(patches, rows, width, footprint))
+            planes.append(_splat(patches, rows, self._width, footprint))
             points += used
-        return *_merge(planes[0], planes[1], _round(self._options.tolerance)), points
+        inverse_depth, sigma = _merge(planes[0], planes[1], _round(self._options.tolerance))
+        self._layers[0, index, : rows[1] - rows[0]] = inverse_depth
+        self._layers[1, index, : rows[1] - rows[0]] = sigma
+        return points
 
     def reduce(
-        self, layers: list[tuple[torch.Tensor, torch.Tensor]], masks: np.ndarray, rules: FusionRules
+        self, masks: np.ndarray, rules: FusionRules, rows: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As `cpu.CpuBackend.reduce`."""
-        t = torch.stack([layer[0] for layer in layers])
-        sigma = torch.stack([layer[1] for layer in layers])
+        t, sigma = self._layers[:, :, : rows[1] - rows[0]]
         bits = torch.from_numpy(masks.view(np.int64)).to(self._device)
         chosen, cameras, counts = _reduce(t, sigma, bits, rules)
         return chosen.cpu().numpy(), cameras.cpu().numpy().view(np.uint64), counts.cpu().numpy()
@@ -255,8 +265,11 @@ def _reduce(
     picks[1] = torch.where(count > 0, 0, -1)
     picks[2] = torch.where(count > 0, (count - 1).clamp(min=0) // 2, -1)
     picks[3] = torch.where(picks[3] >= 0, picks[3], far)
-    picks[~torch.from_numpy(rules.wanted()).to(t.device)] = -1
-    return _gather_picks(picks, t, variance, masks, valid, squared)
+    chosen, cameras, counts = _gather_picks(picks, t, variance, masks, valid, squared)
+    unwanted = ~torch.from_numpy(rules.wanted()).to(t.device)
+    chosen[unwanted], cameras[unwanted] = -1.0, 0
+    counts[:, unwanted[:1].expand(shape)] = 0
+    return chosen, cameras, counts
 
 
 def _gather_picks(
@@ -271,6 +284,7 @@ def _gather_picks(
     chosen = torch.full(picks.shape, -1.0, device=t.device)
     cameras = torch.zeros(picks.shape, dtype=torch.int64, device=t.device)
     counts = torch.zeros((2, *picks.shape[1:]), dtype=torch.uint8, device=t.device)
+    seed = seed_variance = has_seed = t[0]
     for e in range(4):
         index = picks[e].clamp(min=0)[None]
         picked = picks[e] >= 0
@@ -287,6 +301,12 @@ def _gather_picks(
             chosen[e] = torch.where(picked, (center + total / weights).clamp(min=0), -1.0)
             counts[0] = agree.sum(0).clamp(max=255).to(torch.uint8)
             counts[1] = _num_bits(cameras[e]).to(torch.uint8)
+            seed, seed_variance, has_seed = center, spread, picked
+        else:
+            difference = center - seed
+            same = has_seed & (difference * difference <= squared * (seed_variance + spread))
+            chosen[e] = torch.where(same, chosen[0], chosen[e])
+            cameras[e] = torch.where(same, cameras[0], cameras[e])
     return chosen, cameras, counts
 
 
@@ -299,7 +319,12 @@ def _cameras(agree: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
 
 
 def _num_bits(mask: torch.Tensor) -> torch.Tensor:
-    return torch.stack([mask >> c & 1 for c in range(64)]).sum(0)
+    """Bits set, counted in pairs, fours and bytes. Source: H. Warren, Hacker's Delight, 5-1."""
+    mask = (mask & 0x5555555555555555) + (mask >> 1 & 0x5555555555555555)
+    mask = (mask & 0x3333333333333333) + (mask >> 2 & 0x3333333333333333)
+    mask = (mask & 0x0F0F0F0F0F0F0F0F) + (mask >> 4 & 0x0F0F0F0F0F0F0F0F)
+    # Sum of eight bytes, at most 64: it fits into the highest byte, below its sign.
+    return mask * 0x0101010101010101 >> 56
 
 
 def _see(

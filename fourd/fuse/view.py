@@ -1,6 +1,7 @@
 """One target camera at one instant: project all pairs, reduce, colour. Section 3.1 of the paper."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.fuse.cpu import CpuBackend
-from fourd.fuse.geometry import PairFrame, Sources, make_sources, maps_of_pair
+from fourd.fuse.geometry import PairFrame, make_sources, maps_of_pair
 from fourd.fuse.options import ESTIMATES, MAX_CAMERAS, FuseOptions, FusionRules
 from fourd.fuse.reference import ReferenceBackend
 
@@ -23,7 +24,8 @@ class FusedView:
     support: (H, W) uint8 pairs that agree on the consensus;  num_cameras: (H, W) uint8
     source: (H, W) uint8 index into `cameras` of the heaviest source of the first estimate, 255 = none
     cameras: names;  num_pairs: pairs used;  min_pairs: what a consensus needed
-    num_points: valid disparities projected;  status: `ok` or why everything is blank
+    num_points: valid disparities projected, once per tile that they may touch
+    status: `ok` or why everything is blank
     """
 
     rgb: dict[str, np.ndarray]
@@ -77,8 +79,9 @@ def fuse_view(
     num_points = 0
     if pairs:
         sources = make_sources(target, dict(cameras), dict(images))
-        backend = _make_backend(sources, options, height, device)
-        for rows in _tiles(height, width, len(pairs), options.memory_mb):
+        tiles = _tiles(height, width, len(pairs), options.memory_mb)
+        backend = _backend_class(device)(sources, options, target.size, len(pairs), tiles[0][1])
+        for rows in tiles:
             num_points += _fuse_tile(backend, target, pairs, list(images), rules, rows, result)
     status = "ok" if num_points else ("no valid disparity" if pairs else "no usable pair")
     return FusedView(
@@ -117,14 +120,12 @@ def _fuse_tile(
     result: _Arrays,
 ) -> int:
     """Fill rows [first, last) of the result. Returns the points whose source row was read."""
-    layers, masks = [], []
+    masks = []
     num_points = 0
-    for pair in pairs:
-        inverse_depth, sigma, points = backend.layer(maps_of_pair(pair, target), rows, target.size[0])
-        layers.append((inverse_depth, sigma))
+    for index, pair in enumerate(pairs):
+        num_points += backend.layer(index, maps_of_pair(pair, target), rows)
         masks.append(_camera_mask(pair, names))
-        num_points += points
-    chosen, cameras, counts = backend.reduce(layers, np.array(masks, dtype=np.uint64), rules)
+    chosen, cameras, counts = backend.reduce(np.array(masks, dtype=np.uint64), rules, rows)
     rgb, source = backend.colours(chosen, cameras, rows[0])
     part = slice(*rows)
     result.counts[:, part] = counts
@@ -177,15 +178,15 @@ def choose_device(device: str) -> str:
     raise InputError(f"expected a device that torch can use, got {device}: use cpu or auto")
 
 
-def _make_backend(sources: Sources, options: FuseOptions, height: int, device: str) -> Any:
+def _backend_class(device: str) -> Any:
     if device == "cpu":
-        return CpuBackend(sources, options, height)
+        return CpuBackend
     if device == "reference":
-        return ReferenceBackend(sources, options, height)
+        return ReferenceBackend
     # torch takes two seconds to import, and the CPU path does without it.
     from fourd.fuse.torch_kernels import TorchBackend
 
-    return TorchBackend(sources, options, height, device.removeprefix("torch:"))
+    return functools.partial(TorchBackend, device=device.removeprefix("torch:"))
 
 
 def _check(

@@ -81,7 +81,7 @@ def test_blend_starts_as_the_paste_exactly():
     known = ((consensus[:, 3] > 0) | (background[:, 3] > 0))[:, None].expand_as(output)
     assert known.any()
     assert torch.equal(output[known], expected[known])
-    assert torch.equal(output, model.paste(streams))
+    assert torch.equal(output, model.fill_blanks(*model.paste(streams)))
 
 
 def test_blend_can_leave_the_paste_from_the_first_step():
@@ -104,12 +104,31 @@ def test_blend_copies_any_valid_input_and_never_an_invalid_one():
     assert torch.isfinite(output).all()
 
 
-def test_paste_of_blank_streams_is_black_and_of_partly_blank_ones_the_mean_colour():
-    blank = torch.zeros(1, 6, 4, 4, 4)
-    assert torch.equal(model.paste(blank), torch.zeros(1, 3, 4, 4))
-    blank[0, 0, :, 0, :2] = torch.tensor([[0.2, 0.4], [0.2, 0.4], [0.2, 0.4], [1, 1]])
-    pasted = model.paste(blank)
-    assert torch.allclose(pasted[0, :, 3, 3], torch.full((3,), 0.3))
+def test_blanks_are_filled_from_around_and_the_rest_is_kept():
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(1, 3, 13, 22, generator=generator)
+    filled = (torch.rand(1, 1, 13, 22, generator=generator) < 0.4).float()
+    result = model.fill_blanks(image * filled, filled)
+    kept = (filled > 0).expand_as(result)
+    assert torch.equal(result[kept], image[kept])
+    assert result.min() >= image[kept].min() - 1e-6
+    assert result.max() <= image[kept].max() + 1e-6
+    constant = model.fill_blanks(0.3 * filled.expand_as(image), filled)
+    assert torch.allclose(constant, torch.full_like(constant, 0.3), atol=1e-6)
+    halves = torch.zeros(1, 3, 16, 16)
+    halves[..., 12:] = 0.8
+    known = torch.zeros(1, 1, 16, 16)
+    known[..., :4], known[..., 12:] = 1, 1
+    row = model.fill_blanks(halves, known)[0, 0, 8]
+    assert (row.diff() >= -1e-6).all()
+    assert row[5] < 0.3
+    assert row[10] > 0.5
+
+
+def test_all_blank_is_filled_with_black():
+    assert torch.equal(
+        model.fill_blanks(torch.zeros(1, 3, 5, 9), torch.zeros(1, 1, 5, 9)), torch.zeros(1, 3, 5, 9)
+    )
 
 
 def test_black_and_blank_are_different_inputs():

@@ -21,8 +21,7 @@ from fourd.demo import (
 from fourd.demo.__main__ import main
 from fourd.demo.figures import BALL, FIGURE2
 from fourd.demo.phones import CLAP_POSITION, SAMPLE_RATE, SOUND_M_S, clap_times, make_phone, record_audio
-from fourd.demo.truth import whole_folder
-from fourd.io import Archive, read_image, read_json
+from fourd.io import Archive, atomic_folder, read_image, read_json
 
 TINY = DemoOptions(num_cameras=4, num_frames=6, width=96, height=54)
 TINY_FLAGS = ["--num-cameras", "4", "--num-frames", "6", "--width", "96", "--height", "54"]
@@ -89,7 +88,7 @@ def test_sound_in_the_file_is_in_step_with_its_pictures(phone_file: Path) -> Non
     assert start + _delay_s(wanted, decoded) == pytest.approx(0, abs=0.002)
 
 
-def test_camera_command_writes_a_whole_folder(tmp_path: Path) -> None:
+def test_camera_command_writes_a_atomic_folder(tmp_path: Path) -> None:
     main(["camera", "--name", "cam01", "--output", str(tmp_path / "cam01"), *TINY_FLAGS])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cam01"]
     files = sorted((tmp_path / "cam01").iterdir())
@@ -100,7 +99,7 @@ def test_camera_command_writes_a_whole_folder(tmp_path: Path) -> None:
 
 
 def test_interrupted_folder_is_never_taken_for_a_whole_one(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), whole_folder(tmp_path / "cam00") as folder:
+    with pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "cam00") as folder:
         (folder / "000000.png").write_bytes(b"half")
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []

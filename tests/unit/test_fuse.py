@@ -12,6 +12,7 @@ from fourd.errors import InputError
 from fourd.fuse import ESTIMATES, FuseOptions, fuse_view
 from fourd.fuse.cpu import CpuBackend
 from fourd.fuse.geometry import make_sources, maps_of_pair, source_rows
+from fourd.fuse.kernels import reduce_layers
 from fourd.fuse.options import FusionRules
 from fourd.fuse.reference import F, bicubic, keys_weights, reduce_pixel
 from fourd.geometry import look_at
@@ -182,11 +183,13 @@ def test_sigma_grows_with_the_square_of_depth_and_falls_with_confidence():
     target = cameras["cam00"]
     pair = pair_from_plane(cameras, "cam00", "cam01", 4.0)
     rotated = Camera(pair.K_left, pair.R, -pair.R @ pair.center_left, SIZE)
-    backend = CpuBackend(make_sources(target, cameras, make_images(cameras)), OPTIONS, SIZE[1])
+    sources = make_sources(target, cameras, make_images(cameras))
+    backend = CpuBackend(sources, OPTIONS, SIZE, 1, SIZE[1])
     half = dataclasses.replace(
         pair, left_confidence=pair.left_confidence / 2, right_confidence=pair.right_confidence * 0
     )
-    inverse_depth, sigma, _ = backend.layer(maps_of_pair(half, rotated), (0, SIZE[1]), SIZE[0])
+    backend.layer(0, maps_of_pair(half, rotated), (0, SIZE[1]))
+    inverse_depth, sigma = backend._layers[:, 0]
     expected = 0.25 / 0.5 / (pair.K_left[0, 0] * pair.baseline)
     np.testing.assert_allclose(sigma[inverse_depth >= 0], expected, rtol=1e-5)
 
@@ -198,10 +201,13 @@ SAMPLES = st.lists(
 
 
 def reduce_with_kernel(samples, rules):
-    layers = [(np.full((1, 1), t, np.float32), np.full((1, 1), s, np.float32)) for t, s, _ in samples]
+    layers = np.array([[t for t, *_ in samples], [s for _, s, _ in samples]], np.float32)[..., None, None]
     masks = np.array([mask for *_, mask in samples], np.uint64)
-    backend = object.__new__(CpuBackend)
-    chosen, cameras, counts = backend.reduce(layers, masks, rules)
+    chosen, cameras = np.empty((4, 1, 1), np.float32), np.empty((4, 1, 1), np.uint64)
+    counts = np.empty((2, 1, 1), np.uint8)
+    limits = np.float32(rules.tolerance), np.float32(rules.max_front)
+    arguments = masks, *limits, rules.numbers(), rules.wanted(), chosen, cameras, counts
+    reduce_layers(layers[0], layers[1], *arguments)
     return chosen[:, 0, 0], cameras[:, 0, 0], counts[:, 0, 0]
 
 
@@ -234,14 +240,32 @@ def test_a_farther_sample_never_changes_a_consensus(samples):
 
 @settings(max_examples=150, deadline=None)
 @given(SAMPLES)
-def test_estimates_are_ordered_by_depth(samples):
+def test_samples_of_closest_median_farthest_are_ordered(samples):
     if not samples:
         return
-    consensus, closest, median, farthest = reduce_with_kernel(with_masks(samples), RULES)[0]
-    assert closest >= median >= farthest > 0
-    assert consensus == -1 or farthest <= consensus <= closest
-    reference = reduce_pixel(sorted(with_masks(samples), key=lambda i: (-i[0], i[1])), RULES)
-    assert [consensus, closest, median, farthest] == [result[0] for result in reference]
+    no_consensus = dataclasses.replace(RULES, min_pairs=100)
+    consensus, closest, median, farthest = reduce_with_kernel(with_masks(samples), no_consensus)[0]
+    depths = sorted((t for t, _ in samples), reverse=True)
+    assert (consensus, closest, farthest) == (-1, depths[0], depths[-1])
+    assert median == depths[(len(depths) - 1) // 2]
+
+
+@settings(max_examples=150, deadline=None)
+@given(SAMPLES)
+def test_kernel_reduces_a_pixel_as_the_reference(samples):
+    if not samples:
+        return
+    chosen, cameras, counts = reduce_with_kernel(with_masks(samples), RULES)
+    expected = reduce_pixel(sorted(with_masks(samples), key=lambda i: (-i[0], i[1])), RULES)
+    assert [(t, m) for t, m, _ in expected] == [(t, int(m)) for t, m in zip(chosen, cameras, strict=True)]
+    assert counts[0] == expected[0][2]
+
+
+def test_estimates_on_the_surface_of_the_consensus_take_its_depth():
+    samples = with_masks([(F(v), F(0.01)) for v in (2.01, 2.0, 1.99, 1.0)])
+    consensus, closest, median, farthest = reduce_with_kernel(samples, RULES)[0]
+    assert consensus == closest == median and farthest == 1
+    np.testing.assert_allclose(consensus, 2.0, rtol=1e-6)
 
 
 def test_median_of_an_even_number_is_the_closer_of_the_middle_two():
