@@ -70,6 +70,29 @@ def validate(document: Mapping[str, Any], schema: Mapping[str, Any], where: str)
         raise InputError(_explain(errors[0], where))
 
 
+def read_words(document: Mapping[str, Any], schema: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy in which text stands for a number, list or truth value where the schema wants one.
+
+    The engine hands nested values of `--config 'fuse={min_pairs: 4}'` over as text.
+    """
+    read = {}
+    for key, value in document.items():
+        entry = schema.get("properties", {}).get(key, schema.get("additionalProperties"))
+        entry = entry if isinstance(entry, Mapping) else {}
+        kinds = entry.get("type", "string" if "enum" in entry else ())
+        if isinstance(value, Mapping):
+            read[key] = read_words(value, entry)
+        elif isinstance(value, list):
+            read[key] = list(
+                read_words(dict(enumerate(value)), {"additionalProperties": entry.get("items")}).values()
+            )
+        elif isinstance(value, str) and kinds and "string" not in kinds:
+            read[key] = yaml.safe_load(value)
+        else:
+            read[key] = value
+    return read
+
+
 def _explain(error: jsonschema.ValidationError, where: str) -> str:
     key = ".".join(str(part) for part in error.absolute_path) or "the file"
     rule: Any = error.validator_value
@@ -191,6 +214,7 @@ def _check_scene(scene: Scene, where: str) -> None:
 def load_config(given: Mapping[str, Any], scene_settings: Mapping[str, Any], scene: str) -> dict[str, Any]:
     """The full configuration: schema defaults, below the scene's settings, below what was given."""
     schema = load_config_schema()
+    given = read_words(given, schema)
     validate(given, schema, "configuration")
     validate(scene_settings, schema, f"scene {scene}, settings")
     return fill_defaults(merge(scene_settings, given), schema)

@@ -1,14 +1,6 @@
 """Static background: the temporal median of what lies farthest, for every pose of a view."""
 
 
-def sample_disparities(wildcards):
-    return expand(
-        "<results>/{scene}/disparity/{pair}/samples.npz",
-        scene=wildcards.scene,
-        pair=pairs_without(wildcards.view),
-    )
-
-
 rule estimate_background:
     input:
         view="<results>/{scene}/views/{view}.json",

@@ -1,23 +1,18 @@
 """Checked configuration, the lists that span the job graph, and helper functions of the rules."""
 
-import os
+import json
 import sys
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
 
 sys.path.insert(0, workflow.basedir)
-# Jobs start `python -m fourd.<stage>`; they find the package beside the Snakefile, installed or not.
-os.environ["PYTHONPATH"] = os.pathsep.join(
-    filter(None, [str(workflow.basedir), os.environ.get("PYTHONPATH")])
-)
 
 from fourd import config as fourd_config
 from fourd.cli import flags_from_mapping
 from fourd.errors import InputError
 
 try:
-    fourd_config.validate(config, fourd_config.load_config_schema(), "configuration")
     SCENE, _scene_settings = fourd_config.load_scene(config.get("scene", "demo"))
     config = fourd_config.load_config(config, _scene_settings, SCENE.name)
     CHUNK_FRAMES = fourd_config.fit_chunk_frames(config, SCENE)
@@ -69,9 +64,71 @@ def chunk_priority(wildcards):
     )
 
 
-def named(paths, names):
-    """`name=path` words for flags that map cameras to files."""
-    return [f"{name}={path}" for name, path in zip(names, paths, strict=True)]
+def view_flags(wildcards):
+    """Flags that are the same for every job of one view."""
+    flags = {"size": SCENE.size}
+    if wildcards.view in TRAJECTORIES:
+        flags["trajectory"] = json.dumps(TRAJECTORIES[wildcards.view], sort_keys=True)
+    else:
+        flags["frames"] = sorted(VIEW_FRAMES[wildcards.view])
+    return flags_from_mapping(flags)
+
+
+def ingest_of_pair(wildcards):
+    left, right = wildcards.pair.split("-")
+    return {
+        "left": f"<results>/{wildcards.scene}/ingest/{left}.json",
+        "right": f"<results>/{wildcards.scene}/ingest/{right}.json",
+    }
+
+
+def disparity_frames(wildcards):
+    if wildcards.chunk == "samples":
+        return SAMPLE_FRAMES
+    return list(fourd_config.frames_of_chunk(wildcards.chunk))
+
+
+def disparities_of_view(wildcards):
+    return expand(
+        "<results>/{scene}/disparity/{pair}/{chunk}.npz",
+        scene=wildcards.scene,
+        pair=pairs_without(wildcards.view),
+        chunk=scene_chunks(wildcards.view, wildcards.chunk),
+    )
+
+
+def estimates_of_view(wildcards):
+    """Films need the consensus only; physical cameras are trained on and scored with all four."""
+    if wildcards.view in TRAJECTORIES:
+        return "consensus"
+    return "consensus closest median farthest"
+
+
+def sample_disparities(wildcards):
+    return expand(
+        "<results>/{scene}/disparity/{pair}/samples.npz",
+        scene=wildcards.scene,
+        pair=pairs_without(wildcards.view),
+    )
+
+
+def training_files(stage):
+    return [
+        f"<results>/{SCENE.name}/{stage}/{cam}/{chunk}.npz"
+        for cam in SCENE.inputs
+        for chunk in chunks_of_view(cam)
+    ]
+
+
+def evaluated(stage, suffix=""):
+    return lambda wildcards: [
+        f"<results>/{wildcards.scene}/{stage}/{wildcards.cam}/{chunk}{suffix}"
+        for chunk in chunks_of_view(wildcards.cam)
+    ]
+
+
+def labels_of(wildcards):
+    return [f"{SCENE.labels}/{wildcards.cam}"] if SCENE.labels else []
 
 
 FILMS = expand(

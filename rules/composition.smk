@@ -1,14 +1,6 @@
 """Three independent generators, from coarse to fine."""
 
 
-def training_files(stage):
-    return [
-        f"<results>/{SCENE.name}/{stage}/{cam}/{chunk}.npz"
-        for cam in SCENE.inputs
-        for chunk in chunks_of_view(cam)
-    ]
-
-
 rule train_level:
     input:
         views=expand("<results>/{{scene}}/views/{cam}.json", cam=SCENE.inputs),

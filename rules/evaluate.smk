@@ -1,17 +1,6 @@
 """Held-out cameras: what was rendered against what was filmed."""
 
 
-def evaluated(stage, suffix=""):
-    return lambda wildcards: [
-        f"<results>/{wildcards.scene}/{stage}/{wildcards.cam}/{chunk}{suffix}"
-        for chunk in chunks_of_view(wildcards.cam)
-    ]
-
-
-def labels_of(wildcards):
-    return [f"{SCENE.labels}/{wildcards.cam}"] if SCENE.labels else []
-
-
 rule evaluate_camera:
     input:
         view="<results>/{scene}/views/{cam}.json",

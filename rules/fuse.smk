@@ -1,22 +1,6 @@
 """Instantaneous foreground: all pairs of a chunk projected into a view and reduced."""
 
 
-def disparities_of_view(wildcards):
-    return expand(
-        "<results>/{scene}/disparity/{pair}/{chunk}.npz",
-        scene=wildcards.scene,
-        pair=pairs_without(wildcards.view),
-        chunk=scene_chunks(wildcards.view, wildcards.chunk),
-    )
-
-
-def estimates_of_view(wildcards):
-    """Films need the consensus only; physical cameras are trained on and scored with all four."""
-    if wildcards.view in TRAJECTORIES:
-        return "consensus"
-    return "consensus closest median farthest"
-
-
 rule fuse_foreground:
     input:
         view="<results>/{scene}/views/{view}.json",

@@ -9,9 +9,9 @@ rule fetch_pose2sim:
         "<logs>/fetch_pose2sim.log",
     benchmark:
         "<benchmarks>/fetch_pose2sim.tsv"
+    localrule: True
     conda:
         "../envs/vision.yaml"
-    localrule: True
     params:
         version=fourd_config.stage_version("fetch"),
     shell:

@@ -1,20 +1,6 @@
 """The N-choose-2 fan-out: rectification per pair, disparity per pair and chunk."""
 
 
-def ingest_of_pair(wildcards):
-    left, right = wildcards.pair.split("-")
-    return {
-        "left": f"<results>/{wildcards.scene}/ingest/{left}.json",
-        "right": f"<results>/{wildcards.scene}/ingest/{right}.json",
-    }
-
-
-def disparity_frames(wildcards):
-    if wildcards.chunk == "samples":
-        return SAMPLE_FRAMES
-    return list(fourd_config.frames_of_chunk(wildcards.chunk))
-
-
 rule rectify_pair:
     input:
         cameras="<results>/{scene}/sfm/cameras.json",

@@ -1,17 +1,5 @@
 """Where and when every film and every training target is taken from."""
 
-import json
-
-
-def view_flags(wildcards):
-    """Flags that are the same for every job of one view."""
-    flags = {"size": SCENE.size}
-    if wildcards.view in TRAJECTORIES:
-        flags["trajectory"] = json.dumps(TRAJECTORIES[wildcards.view], sort_keys=True)
-    else:
-        flags["frames"] = sorted(VIEW_FRAMES[wildcards.view])
-    return flags_from_mapping(flags)
-
 
 rule place_view:
     input:

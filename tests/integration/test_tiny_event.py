@@ -43,7 +43,7 @@ def hashes(workspace: Workspace) -> dict[str, str]:
 
 def planned(workspace: Workspace, *arguments: str) -> set[str]:
     """Rules that a dry run would run."""
-    output = workspace.snakemake("-n", "--quiet", "rules", "host", "render_all", *arguments).stdout
+    output = workspace.snakemake("render_all", "-n", "--quiet", "rules", "host", *arguments).stdout
     if "Nothing to be done" in output:
         return set()
     table = output.split("Job stats:")[1].split("total")[0]
@@ -79,12 +79,15 @@ def test_second_run_does_nothing(finished: Workspace) -> None:
 @pytest.mark.parametrize(
     ("setting", "rules"),
     [
-        ("render={crf: 30}", {"encode_film", "render_frames", "evaluate_camera", "collect_metrics"}),
+        (
+            "render={min_hole_share: 0.5}",
+            {"encode_film", "render_frames", "evaluate_camera", "collect_metrics"},
+        ),
         (
             "composition={epochs: 3}",
             {"train_level", "render_frames", "encode_film", "evaluate_camera", "collect_metrics"},
         ),
-        ("evaluate={ssim_sigma: 2.0}", {"evaluate_camera", "collect_metrics"}),
+        ("evaluate={sheet_frames: 2}", {"evaluate_camera", "collect_metrics"}),
     ],
 )
 def test_a_setting_runs_exactly_what_is_below_it(finished: Workspace, setting: str, rules: set[str]) -> None:

@@ -75,6 +75,14 @@ def test_wrong_type_and_range_are_named() -> None:
         config.load_config({"chunk_frames": "ten"}, {}, "event")
 
 
+def test_text_from_the_command_line_is_read_by_the_schema() -> None:
+    given = {"views": {"train_frames": "7"}, "composition": {"num_filters": ["8", "8"], "crop": "null"}}
+    full = config.load_config(given, {}, "event")
+    assert full["views"]["train_frames"] == 7
+    assert full["composition"]["num_filters"] == [8, 8]
+    assert full["composition"]["crop"] is None
+
+
 def test_given_wins_over_scene_settings_over_defaults() -> None:
     full = config.load_config({"views": {"train_frames": 7}}, {"views": {"train_frames": 5}}, "event")
     assert full["views"]["train_frames"] == 7

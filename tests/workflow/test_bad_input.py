@@ -19,7 +19,10 @@ def sentence(output: str) -> str:
     ("change", "expected"),
     [
         ({"cameras": {}}, "cameras is {}"),
-        ({"cameras": {"cam00": {"source": "a"}}}, "expected at least 2 cameras that are not held out, got 1"),
+        (
+            {"cameras": {"cam00": {"source": "a"}}, "heldout": []},
+            "expected at least 2 cameras that are not held out, got 1",
+        ),
         ({"heldout": ["cam11"]}, "heldout names 'cam11', which is no camera; cameras are cam00"),
         ({"num_frames": "six"}, "num_frames is 'six', expected type integer"),
         ({"fps": 0}, "fps is 0, expected more than 0"),

@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import Workspace, tiny_scene
 
-DRY_RUN = ("-n", "--quiet", "rules", "host")
+DRY_RUN = ("render_all", "-n", "--quiet", "rules", "host")
 
 
 def job_counts(output: str) -> dict[str, int]:
@@ -32,7 +32,7 @@ def large_scene(workspace: Workspace, num_cameras: int, num_frames: int, heldout
 
 def test_demo_counts(workspace: Workspace) -> None:
     workspace.write_scene("demo", tiny_scene(num_cameras=5, num_frames=6))
-    result = workspace.snakemake(*DRY_RUN, "render_all")
+    result = workspace.snakemake(*DRY_RUN)
     assert result.returncode == 0, result.stdout
     counts = job_counts(result.stdout)
     # 4 inputs and 1 held-out camera, 2 chunks, 3 trajectories of which one has a frozen clock.
@@ -52,7 +52,7 @@ def test_fifteen_cameras_nine_hundred_frames(workspace: Workspace) -> None:
     workspace.write_config({"scene": "large"})
     workspace.write_scene("large", large_scene(workspace, 15, 900))
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    result = workspace.snakemake(*DRY_RUN, "render_all")
+    result = workspace.snakemake(*DRY_RUN)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert result.returncode == 0, result.stdout
     counts = job_counts(result.stdout)
@@ -67,15 +67,15 @@ def test_fifteen_cameras_nine_hundred_frames(workspace: Workspace) -> None:
 def test_too_many_jobs_are_refused_with_a_chunk_size_that_fits(workspace: Workspace) -> None:
     workspace.write_config({"scene": "large", "chunk_frames": 1})
     workspace.write_scene("large", large_scene(workspace, 15, 900))
-    result = workspace.snakemake(*DRY_RUN, "render_all")
+    result = workspace.snakemake(*DRY_RUN)
     assert result.returncode != 0
     proposed = re.search(r"use chunk_frames (\d+) or more", " ".join(result.stdout.split()))
     assert proposed, result.stdout
     workspace.write_config({"scene": "large", "chunk_frames": int(proposed[1])})
-    assert workspace.snakemake(*DRY_RUN, "render_all").returncode == 0
+    assert workspace.snakemake(*DRY_RUN).returncode == 0
 
 
-@pytest.mark.parametrize("arguments", [("--lint",), ("--rulegraph", "render_all")])
+@pytest.mark.parametrize("arguments", [("--lint",), ("render_all", "--rulegraph")])
 def test_lint_and_rule_graph(workspace: Workspace, arguments: tuple[str, ...]) -> None:
     workspace.write_scene("demo", tiny_scene())
     result: subprocess.CompletedProcess[str] = workspace.snakemake(*arguments)
