@@ -14,7 +14,11 @@ from fourd.errors import InputError
 from fourd.trajectory import scene_frames
 
 SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "config" / "schemas"
-SAMPLES = "samples"
+
+# Two directions of int16 disparity and uint8 confidence; a rectified image is about as large as a film's.
+PAIR_BYTES_PER_PIXEL = 2 * (2 + 1)
+# Four estimates with masks, depth and counts, and two backgrounds with depth (docs/formats.md).
+FUSED_BYTES_PER_PIXEL = 23 + 13
 
 
 def load_yaml(path: Path | str) -> dict[str, Any]:
@@ -283,6 +287,29 @@ def fit_chunk_frames(config: Mapping[str, Any], scene: Scene) -> int:
             f"use chunk_frames {min(fits, scene.num_frames)} or more, or raise max_jobs"
         )
     return chunk_frames
+
+
+def kept_intermediates(
+    scene: Scene, config: Mapping[str, Any], frames: Mapping[str, Mapping[int, int]]
+) -> frozenset[str]:
+    """Which of `foreground` and `disparity` stay on the disk after the run, within `keep_gb`.
+
+    Foregrounds (with their backgrounds) come first: with them a changed network or score touches
+    nothing above it. Disparities are what a new trajectory needs.
+    """
+    pixels = scene.size[0] * scene.size[1]
+    num_samples = min(config["background"]["num_samples"], scene.num_frames)
+    sizes = {
+        "foreground": sum(map(len, frames.values())) * pixels * FUSED_BYTES_PER_PIXEL,
+        "disparity": len(scene.pairs) * (scene.num_frames + num_samples) * pixels * PAIR_BYTES_PER_PIXEL,
+    }
+    kept: set[str] = set()
+    total = 0
+    for name, size in sizes.items():
+        total += size
+        if total <= config["keep_gb"] * 1e9:
+            kept.add(name)
+    return frozenset(kept)
 
 
 def check_sources(scene: Scene, made_by_rules: tuple[str, ...]) -> None:

@@ -8,7 +8,7 @@ rule estimate_background:
         ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
         disparity=sample_disparities,
     output:
-        temp("<results>/{scene}/background/{view}/{chunk}.npz"),
+        intermediate("foreground", "<results>/{scene}/background/{view}/{chunk}.npz"),
     log:
         "<logs>/{scene}/estimate_background/{view}/{chunk}.log",
     benchmark:

@@ -20,6 +20,7 @@ try:
     fourd_config.check_sources(SCENE, made_by_rules=("data/demo/", "data/pose2sim/"))
     # Output frame -> scene frame, for every place that is filmed from.
     VIEW_FRAMES = fourd_config.view_frames(SCENE, config)
+    KEPT = fourd_config.kept_intermediates(SCENE, config, VIEW_FRAMES)
 except InputError as error:
     raise WorkflowError(str(error)) from None
 
@@ -55,6 +56,11 @@ def pairs_without(view):
 def options(section):
     """A section of the configuration as command-line flags."""
     return flags_from_mapping(config[section])
+
+
+def intermediate(kind, path):
+    """A file that is removed after its last use unless the disk budget keeps its kind."""
+    return path if kind in KEPT else temp(path)
 
 
 def chunk_priority(wildcards):

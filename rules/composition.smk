@@ -17,7 +17,8 @@ rule train_level:
         "<benchmarks>/{scene}/train_level/{level}.tsv"
     conda:
         "../envs/torch.yaml"
-    threads: workflow.cores
+    # As many as there are: the engine caps it at --cores.
+    threads: 16
     resources:
         gpu=1,
     params:

@@ -8,7 +8,7 @@ rule fuse_foreground:
         ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
         disparity=disparities_of_view,
     output:
-        temp("<results>/{scene}/foreground/{view}/{chunk}.npz"),
+        intermediate("foreground", "<results>/{scene}/foreground/{view}/{chunk}.npz"),
     log:
         "<logs>/{scene}/fuse_foreground/{view}/{chunk}.log",
     benchmark:

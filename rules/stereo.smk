@@ -28,7 +28,7 @@ rule disparity:
         cameras="<results>/{scene}/sfm/cameras.json",
         rectification="<results>/{scene}/rectification/{pair}.npz",
     output:
-        temp("<results>/{scene}/disparity/{pair}/{chunk}.npz"),
+        intermediate("disparity", "<results>/{scene}/disparity/{pair}/{chunk}.npz"),
     log:
         "<logs>/{scene}/disparity/{pair}/{chunk}.log",
     benchmark:

@@ -65,10 +65,22 @@ def test_every_result_is_finite_and_complete(finished: Workspace) -> None:
     assert read_json(results(finished) / "sfm" / "cameras.json")["heldout"] == ["cam02"]
 
 
-def test_temporary_files_are_gone_and_none_is_half_written(finished: Workspace) -> None:
-    left = [path for path in results(finished).rglob("*") if ".tmp" in path.name]
-    assert left == []
-    assert not list(results(finished).glob("disparity/**/*.npz"))
+def test_no_file_is_half_written(finished: Workspace) -> None:
+    assert [path for path in results(finished).rglob("*") if ".tmp" in path.name] == []
+
+
+def test_without_a_disk_budget_intermediates_are_removed(finished: Workspace, tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path)
+    scene = tiny_scene(num_cameras=3, num_frames=2)
+    scene |= {"heldout": [], "labels": None}
+    scene["settings"] |= {"keep_gb": 0, "trajectories": {"hold_view": {"kind": "hold", "num_frames": 2}}}
+    workspace.write_scene("demo", scene)
+    result = workspace.snakemake("--cores", "2", "render_all")
+    assert result.returncode == 0, result.stdout[-4000:]
+    assert (results(workspace) / "render" / "hold_view.mp4").is_file()
+    for stage in ("disparity", "foreground", "background"):
+        assert not list(results(workspace).glob(f"{stage}/*/*.npz"))
+    assert results(finished).joinpath("foreground").is_dir()
 
 
 def test_second_run_does_nothing(finished: Workspace) -> None:
@@ -91,9 +103,18 @@ def test_second_run_does_nothing(finished: Workspace) -> None:
     ],
 )
 def test_a_setting_runs_exactly_what_is_below_it(finished: Workspace, setting: str, rules: set[str]) -> None:
-    """Temporary inputs of a rule that runs again are made again; nothing above them is."""
-    remade = {"disparity", "fuse_foreground", "estimate_background"}
-    assert planned(finished, "--config", setting) - remade == rules
+    assert planned(finished, "--config", setting) == rules
+
+
+def test_another_trajectory_runs_for_itself_only(finished: Workspace) -> None:
+    extra = "trajectories={freeze_time: {kind: arc, time: frozen, num_frames: 2}, low: {kind: hold, position: 0.2}}"
+    assert planned(finished, "--config", extra) == {
+        "place_view",
+        "fuse_foreground",
+        "estimate_background",
+        "render_frames",
+        "encode_film",
+    }
 
 
 def test_killed_run_goes_on_and_ends_with_the_same_bytes(finished: Workspace, tmp_path: Path) -> None:

@@ -65,13 +65,13 @@ def test_fifteen_cameras_nine_hundred_frames(workspace: Workspace) -> None:
 
 
 def test_too_many_jobs_are_refused_with_a_chunk_size_that_fits(workspace: Workspace) -> None:
-    workspace.write_config({"scene": "large", "chunk_frames": 1})
-    workspace.write_scene("large", large_scene(workspace, 15, 900))
+    workspace.write_config({"scene": "large", "chunk_frames": 1, "max_jobs": 2000})
+    workspace.write_scene("large", large_scene(workspace, 8, 120))
     result = workspace.snakemake(*DRY_RUN)
     assert result.returncode != 0
     proposed = re.search(r"use chunk_frames (\d+) or more", " ".join(result.stdout.split()))
     assert proposed, result.stdout
-    workspace.write_config({"scene": "large", "chunk_frames": int(proposed[1])})
+    workspace.write_config({"scene": "large", "chunk_frames": int(proposed[1]), "max_jobs": 2000})
     assert workspace.snakemake(*DRY_RUN).returncode == 0
 
 
