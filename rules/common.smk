@@ -32,8 +32,8 @@ SAMPLE_FRAMES = fourd_config.spread_frames(SCENE.num_frames, config["background"
 
 def chunks_of_view(view):
     """Chunks of output frames in which a view has any."""
-    last = max(VIEW_FRAMES[view])
-    names = fourd_config.chunk_names(last + 1, CHUNK_FRAMES)
+    num_frames = len(VIEW_FRAMES[view]) if view in TRAJECTORIES else SCENE.num_frames
+    names = fourd_config.chunk_names(num_frames, CHUNK_FRAMES)
     return [c for c in names if frames_of_view(view, c)]
 
 
@@ -118,12 +118,25 @@ def sample_disparities(wildcards):
     )
 
 
-def training_files(stage):
+def training_foregrounds():
     return [
-        f"<results>/{SCENE.name}/{stage}/{cam}/{chunk}.npz"
+        f"<results>/{SCENE.name}/foreground/{cam}/{chunk}.npz"
         for cam in SCENE.inputs
         for chunk in chunks_of_view(cam)
     ]
+
+
+def training_backgrounds():
+    """In groups of as many poses as a chunk has frames: a background needs no other frames than its own."""
+    groups = []
+    for cam in SCENE.inputs:
+        frames = sorted(VIEW_FRAMES[cam])
+        for first in range(0, len(frames), CHUNK_FRAMES):
+            last = frames[min(first + CHUNK_FRAMES, len(frames)) - 1]
+            groups.append(
+                f"<results>/{SCENE.name}/background/{cam}/{frames[first]:06d}-{last:06d}.npz"
+            )
+    return groups
 
 
 def evaluated(stage, suffix=""):

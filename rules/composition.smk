@@ -6,8 +6,8 @@ rule train_level:
         views=expand("<results>/{{scene}}/views/{cam}.json", cam=SCENE.inputs),
         cameras="<results>/{scene}/sfm/cameras.json",
         ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
-        foreground=training_files("foreground"),
-        background=training_files("background"),
+        foreground=training_foregrounds(),
+        background=training_backgrounds(),
     output:
         model="<results>/{scene}/composition/{level}/model.pt",
         table="<results>/{scene}/composition/{level}/train.csv",

@@ -1,6 +1,37 @@
 """Instantaneous foreground: all pairs of a chunk projected into a view and reduced."""
 
 
+# All training targets of a chunk in one job: they read the same disparities, and with a job for
+# each of them the graph would have as many edges as pairs times cameras times chunks.
+rule fuse_training:
+    input:
+        view=expand("<results>/{{scene}}/views/{cam}.json", cam=SCENE.inputs),
+        cameras="<results>/{scene}/sfm/cameras.json",
+        ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
+        disparity=expand("<results>/{{scene}}/disparity/{pair}/{{chunk}}.npz", pair=SCENE.pairs),
+    output:
+        [
+            intermediate("foreground", f"<results>/{{scene}}/foreground/{cam}/{{chunk}}.npz")
+            for cam in SCENE.inputs
+        ],
+    log:
+        "<logs>/{scene}/fuse_training/{chunk}.log",
+    benchmark:
+        "<benchmarks>/{scene}/fuse_training/{chunk}.tsv"
+    priority: 10
+    conda:
+        "../envs/torch.yaml"
+    threads: 1
+    params:
+        frames=lambda wildcards: frames_of_view(SCENE.inputs[0], wildcards.chunk),
+        options=options("fuse"),
+        version=fourd_config.stage_version("fuse"),
+    shell:
+        "python -m fourd.fuse foreground --view-file {input.view} --cameras {input.cameras}"
+        " --frames {params.frames} --disparity {input.disparity} --ingest {input.ingest}"
+        " {params.options} --output {output} 2> {log}"
+
+
 rule fuse_foreground:
     input:
         view="<results>/{scene}/views/{view}.json",
@@ -13,6 +44,8 @@ rule fuse_foreground:
         "<logs>/{scene}/fuse_foreground/{view}/{chunk}.log",
     benchmark:
         "<benchmarks>/{scene}/fuse_foreground/{view}/{chunk}.tsv"
+    wildcard_constraints:
+        view="|".join([*SCENE.heldout, *TRAJECTORIES]),
     priority: 10
     conda:
         "../envs/torch.yaml"

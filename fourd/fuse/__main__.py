@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
+from fourd.errors import InputError
 from fourd.fuse.files import DisparityFiles, Pictures, Progress
 from fourd.fuse.options import ESTIMATES, FuseOptions
 from fourd.fuse.view import FusedView, choose_device, fuse_view
@@ -91,30 +92,36 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m fourd.fuse", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("foreground", help="instantaneous images of a view")
-    command.add_argument("--view-file", type=Path, required=True, help="views/{view}.json")
+    command.add_argument("--view-file", type=Path, nargs="+", required=True, help="views/{view}.json")
     command.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
-    command.add_argument("--frames", type=int, nargs="+", required=True, help="output frames of the view")
+    command.add_argument("--frames", type=int, nargs="+", required=True, help="output frames of the views")
     command.add_argument("--disparity", type=Path, nargs="*", default=[], help="files of all pairs")
     command.add_argument("--ingest", nargs="*", default=[], help="ingest/{cam}.json, or CAMERA=PATH")
     command.add_argument("--estimates", nargs="+", choices=ESTIMATES, default=list(ESTIMATES))
     command.add_argument("--device", default="auto", help="auto, cpu or a torch device")
-    command.add_argument("--output", type=Path, required=True)
+    command.add_argument("--output", type=Path, nargs="+", required=True, help="one file per view file")
     add_options(command, FuseOptions)
     args = parser.parse_args(argv)
+    if len(args.view_file) != len(args.output):
+        raise InputError(
+            f"expected one --output per --view-file, got {len(args.output)} for {len(args.view_file)}: "
+            "name as many of the one as of the other"
+        )
     set_num_threads(1)
     # The depth, support and source in the file are those of the consensus.
     estimates = [name for name in ESTIMATES if name in {"consensus", *args.estimates}]
-    run(
-        args.view_file,
-        args.cameras,
-        args.frames,
-        args.disparity,
-        args.ingest,
-        estimates,
-        options_from_args(FuseOptions, args),
-        choose_device(args.device),
-        args.output,
-    )
+    for view_path, output in zip(args.view_file, args.output, strict=True):
+        run(
+            view_path,
+            args.cameras,
+            args.frames,
+            args.disparity,
+            args.ingest,
+            estimates,
+            options_from_args(FuseOptions, args),
+            choose_device(args.device),
+            output,
+        )
 
 
 if __name__ == "__main__":

@@ -107,7 +107,7 @@ def test_a_setting_runs_exactly_what_is_below_it(finished: Workspace, setting: s
 
 
 def test_another_trajectory_runs_for_itself_only(finished: Workspace) -> None:
-    extra = "trajectories={freeze_time: {kind: arc, time: frozen, num_frames: 2}, low: {kind: hold, position: 0.2}}"
+    extra = "trajectories={freeze_time: {kind: arc, time: frozen}, low: {kind: hold, position: 0.2}}"
     assert planned(finished, "--config", extra) == {
         "place_view",
         "fuse_foreground",
