@@ -261,11 +261,11 @@ def num_levels(scene: Scene, config: Mapping[str, Any]) -> int:
     """Resolutions of the composition that the films' size calls for (paper 4.1).
 
     The paper's levels are 270, 540 and 1080 lines. A level is left out when the films have fewer
-    than three quarters of its lines; `composition.max_levels` bounds the number further.
+    than three quarters of its lines; `max_levels` bounds the number further.
     """
     lines = min(scene.size)
     wanted = 1 + sum(lines >= 0.75 * level_lines for level_lines in (540, 1080))
-    return min(wanted, config["composition"].get("max_levels", 3))
+    return min(wanted, config["max_levels"])
 
 
 def fit_chunk_frames(config: Mapping[str, Any], scene: Scene) -> int:

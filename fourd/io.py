@@ -160,8 +160,14 @@ class Archive:
         self._names = {name.removesuffix(".npy") for name in self._zip.namelist()}
 
     def __getitem__(self, name: str) -> np.ndarray:
-        with self._zip.open(name + ".npy") as member:
-            return np.lib.format.read_array(member, allow_pickle=False)
+        """One array. Raises KeyError if there is none of that name, InputError if its bytes are damaged."""
+        try:
+            with self._zip.open(name + ".npy") as member:
+                return np.lib.format.read_array(member, allow_pickle=False)
+        except (zipfile.BadZipFile, ValueError, EOFError) as error:
+            raise InputError(
+                f"{self.path}: the bytes of {name} are damaged ({error}); delete the file and run again"
+            ) from None
 
     def __contains__(self, name: str) -> bool:
         return name in self._names

@@ -124,6 +124,9 @@ def train(
     total = options.epochs * len(training)
     progress = Progress(total, counters["step"])
     started = time.monotonic() - counters["elapsed_s"]
+    if not counters["rows"] and counters["step"] == 0:
+        # What the untrained network gives: without it nobody could tell what training added.
+        counters["rows"].append(_log_row(trainer, samples, apart, 0))
     while counters["step"] < total and not _is_over(options.max_minutes, started):
         step = counters["step"]
         epoch, position = divmod(step, len(training))

@@ -245,9 +245,10 @@ def test_time_limit_stops_early_and_still_gives_a_model(sources, tmp_path):
 def test_log_has_a_row_per_epoch_with_every_column(sources, tmp_path):
     train_model(sources, tmp_path)
     rows = io.read_csv(tmp_path / "train.csv")
-    assert [row["epoch"] for row in rows] == ["1", "2"]
-    assert [row["step"] for row in rows] == ["6", "12"]
-    assert all(float(row["reconstruction"]) > 0 and row["skipped_steps"] == "0" for row in rows)
+    assert [row["epoch"] for row in rows] == ["0", "1", "2"]
+    assert [row["step"] for row in rows] == ["0", "6", "12"]
+    assert rows[0]["reconstruction"] == ""
+    assert all(float(row["reconstruction"]) > 0 and row["skipped_steps"] == "0" for row in rows[1:])
 
 
 def test_trained_model_beats_the_paste_at_test_time_inputs(sources, tmp_path):

@@ -70,6 +70,17 @@ def test_cut_archive_is_refused_with_its_name(tmp_path: Path) -> None:
         io.Archive(path)
 
 
+def test_damaged_bytes_are_noticed_by_their_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "damaged.npz"
+    with io.ArchiveWriter(path) as archive:
+        archive.add("x", np.arange(1000))
+    data = bytearray(path.read_bytes())
+    data[1000] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"damaged\.npz: the bytes of x are damaged"):
+        io.Archive(path)["x"]
+
+
 def test_image_round_trip_is_rgb(tmp_path: Path) -> None:
     image = np.zeros((4, 6, 3), np.uint8)
     image[..., 0] = 200
