@@ -33,11 +33,11 @@ def results(workspace: Workspace) -> Path:
 
 
 def hashes(workspace: Workspace) -> dict[str, str]:
-    """Digest of every final file; tables of run times are no results."""
+    """Digest of every result; a checkpoint and a table that hold run times are none."""
     return {
         str(path.relative_to(results(workspace))): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(results(workspace).rglob("*"))
-        if path.suffix in (".png", ".mp4", ".json", ".pt") or path.name == "metrics.csv"
+        if path.suffix in (".png", ".mp4", ".json") or path.name in ("metrics.csv", "model.pt")
     }
 
 

@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from fourd.cli import run_stage
-from fourd.config import load_scene
+from fourd.config import load_config, load_scene
 from fourd.errors import InputError
 from fourd.init import SceneDraft, film_size, main, scene_text
 from fourd.io import write_json, write_png
@@ -53,7 +53,8 @@ def test_written_scene_is_accepted_by_the_workflow(tmp_path):
     scene, settings = load_scene("street", tmp_path / "scenes")
     assert [camera.source for camera in scene.cameras.values()] == films
     assert [camera.calibration_name for camera in scene.cameras.values()] == ["left", "mid: 2", "right"]
-    assert (scene.heldout, scene.calibration, settings) == (("cam01",), (calibration,), {})
+    assert (scene.heldout, scene.calibration) == (("cam01",), (calibration,))
+    load_config({}, settings, "street")
 
 
 def test_folders_take_the_default_rate_or_the_given_one(tmp_path):
