@@ -20,7 +20,8 @@ import yaml
 from fourd.cli import run_stage
 from fourd.errors import InputError
 from fourd.ingest import Source, probe_source
-from fourd.io import read_json, write_text
+from fourd.io import write_text
+from fourd.sfm.importers import read_calibration
 
 NAME_PATTERN = "[a-z][a-z0-9_]*"
 CAMERA_PATTERN = r"cam\d{1,4}"
@@ -70,19 +71,17 @@ def name_cameras(paths: Sequence[str]) -> list[str]:
 def match_calibration_names(
     cameras: Sequence[str], paths: Sequence[str], calibration: Sequence[str]
 ) -> list[str | None]:
-    """For each source the camera of the workflow's own calibration JSON that belongs to it.
+    """For each source the camera of the calibration, of any format, that belongs to it.
 
     A name that equals the file's or folder's stem wins; if any stem has none, the order counts.
-    None where the camera's own name will do, and for every other calibration format.
-    Raises InputError if the calibration has fewer cameras than there are sources.
+    None where the camera's own name will do.
+    Raises InputError if a calibration cannot be read or has fewer cameras than there are sources.
     """
     names: list[str] = []
     for file in calibration:
         if not Path(file).exists():
             raise InputError(f"expected a calibration at {file}, found nothing: check --calibration")
-        document = read_json(file) if Path(file).suffix == ".json" else {}
-        if isinstance(document.get("cameras"), dict):
-            names += document["cameras"]
+        names += read_calibration(file).cameras
     if not names:
         return [None] * len(paths)
     belonging = [Path(path).stem for path in paths]
@@ -153,7 +152,7 @@ def scene_text(name: str, draft: SceneDraft) -> str:
         "# Nearest and farthest depth worth seeing, in the calibration's units; estimated if left out.",
         "# depth_range: [1.5, 30]",
         "",
-        "# A network that two cores train in minutes. With a GPU take this out: the defaults are the paper's.",
+        "# A network that two cores train in minutes; with a GPU take it out",
         "settings:",
         "  composition: {num_filters: [8, 8, 8], crop: 192, epochs: 6, learning_rate: 0.0005}",
     ]

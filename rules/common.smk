@@ -165,11 +165,18 @@ EVALUATION = (
 
 
 def print_finished():
-    """Where to look, when everything is done."""
+    """Where to look, and what was left out, when everything is done."""
+    # Imported here: it loads OpenCV, which a dry run does not need.
+    from fourd.stereo.files import refused_pairs
+
     folder = Path(config["pathvars"].get("results", "results")) / SCENE.name
     films = [p for p in (folder / "render" / f"{name}.mp4" for name in TRAJECTORIES) if p.is_file()]
-    table = folder / "evaluate" / "table.md"
     print(f"\nFilms of {SCENE.name}:", *(f"  {film}" for film in films), sep="\n")
+    refused = refused_pairs([folder / "rectification" / f"{pair}.npz" for pair in SCENE.pairs])
+    if refused:
+        print(f"\n{len(refused)} of {len(SCENE.pairs)} pairs of cameras were left out:")
+        print(*(f"  {pair}: {reason}" for pair, reason in refused.items()), sep="\n")
+    table = folder / "evaluate" / "table.md"
     if SCENE.heldout and table.is_file():
         print(f"\n{table.read_text()}\nPictures: {folder / 'evaluate' / 'contact_sheet.png'}")
 

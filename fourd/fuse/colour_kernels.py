@@ -1,5 +1,7 @@
 """Compiled sampling of colours from the original images through a fused depth; one core, float32."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numba import njit
 
@@ -20,6 +22,17 @@ def pack_sources(sources: Sources) -> np.ndarray:
     count = len(sources.names)
     parts = [sources.A.reshape(count, 9), sources.b, sources.lens, sources.distortion]
     return np.ascontiguousarray(np.concatenate(parts, axis=1))
+
+
+def pack_images(images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """All images as one flat uint8 buffer, and (C,) int64 where each begins.
+
+    Edges repeat once above and to the left, twice below and to the right, as bicubic sampling needs.
+    Sixteen bytes more may be read after the last.
+    """
+    padded = [np.pad(image, ((1, 2), (1, 2), (0, 0)), mode="edge").ravel() for image in images]
+    starts = np.concatenate([[0], np.cumsum([image.size for image in padded])[:-1]]).astype(np.int64)
+    return np.concatenate([*padded, np.zeros(16, np.uint8)]), starts
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -74,38 +87,25 @@ def _keys(f, a):
 
 
 @njit(cache=True, nogil=True)
-def _mix_rows(image, at, w, r0, r1, r2, r3):
-    """Four rows of one channel of one column, weighted. Unsigned, so that no index can wrap."""
-    upper = w[0] * np.float32(image[r0 + at]) + w[1] * np.float32(image[r1 + at])
-    lower = w[2] * np.float32(image[r2 + at]) + w[3] * np.float32(image[r3 + at])
-    return upper + lower
+def _sample(image, start, width, px, py, a, columns):
+    """Bicubic r, g, b at (px, py) of an image of `pack_images`, `width` columns wide before padding.
 
-
-@njit(cache=True, nogil=True)
-def _mix_channel(image, channel, wx, wy, c0, c1, c2, c3, r0, r1, r2, r3):
-    """Sixteen samples of one channel, weighted."""
-    first = wx[0] * _mix_rows(image, c0 + channel, wy, r0, r1, r2, r3)
-    second = wx[1] * _mix_rows(image, c1 + channel, wy, r0, r1, r2, r3)
-    third = wx[2] * _mix_rows(image, c2 + channel, wy, r0, r1, r2, r3)
-    fourth = wx[3] * _mix_rows(image, c3 + channel, wy, r0, r1, r2, r3)
-    return (first + second) + (third + fourth)
-
-
-@njit(cache=True, nogil=True)
-def _sample(image, start, width, height, px, py, a):
-    """Bicubic r, g, b at (px, py) of an image that starts at `start` of a flat buffer; edges repeat."""
+    columns: (16,) float32 scratch. The four pixels of a row are twelve adjacent bytes, so one loop
+    mixes the four rows; it reads sixteen, a multiple of the length of vector registers.
+    """
     x, y = int(px), int(py)
     wx, wy = _keys(px - np.float32(x), a), _keys(py - np.float32(y), a)
-    r0 = np.uint64(start + 3 * width * max(y - 1, 0))
-    r1 = np.uint64(start + 3 * width * y)
-    r2 = np.uint64(start + 3 * width * min(y + 1, height - 1))
-    r3 = np.uint64(start + 3 * width * min(y + 2, height - 1))
-    c0, c1 = np.uint64(3 * max(x - 1, 0)), np.uint64(3 * x)
-    c2, c3 = np.uint64(3 * min(x + 1, width - 1)), np.uint64(3 * min(x + 2, width - 1))
+    stride = 3 * (width + 3)
+    r0 = np.uint64(start + stride * y + 3 * x)
+    r1, r2, r3 = r0 + np.uint64(stride), r0 + np.uint64(2 * stride), r0 + np.uint64(3 * stride)
+    for k in range(np.uint64(columns.shape[0])):
+        upper = wy[0] * np.float32(image[r0 + k]) + wy[1] * np.float32(image[r1 + k])
+        lower = wy[2] * np.float32(image[r2 + k]) + wy[3] * np.float32(image[r3 + k])
+        columns[k] = upper + lower
     return (
-        _mix_channel(image, np.uint64(0), wx, wy, c0, c1, c2, c3, r0, r1, r2, r3),
-        _mix_channel(image, np.uint64(1), wx, wy, c0, c1, c2, c3, r0, r1, r2, r3),
-        _mix_channel(image, np.uint64(2), wx, wy, c0, c1, c2, c3, r0, r1, r2, r3),
+        (wx[0] * columns[0] + wx[1] * columns[3]) + (wx[2] * columns[6] + wx[3] * columns[9]),
+        (wx[0] * columns[1] + wx[1] * columns[4]) + (wx[2] * columns[7] + wx[3] * columns[10]),
+        (wx[0] * columns[2] + wx[1] * columns[5]) + (wx[2] * columns[8] + wx[3] * columns[11]),
     )
 
 
@@ -133,7 +133,7 @@ def _to_byte(value):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _blend(found, num_sources, best, x, px, py, cost, params, image, starts, a):
+def _blend(found, num_sources, best, x, px, py, cost, params, image, starts, a, columns):
     """Weighted mean of the first `num_sources` of `found` ranked sources: r, g, b in 0..255."""
     red, green, blue, weights = _ZERO, _ZERO, _ZERO, _ZERO
     for i in range(min(found, num_sources)):
@@ -141,8 +141,8 @@ def _blend(found, num_sources, best, x, px, py, cost, params, image, starts, a):
         w = _ONE / cost[c, x]
         if found > num_sources:
             w *= max(_ONE - cost[c, x] / cost[best[num_sources], x], _MIN_WEIGHT)
-        width, height = int(params[c, 19]) + 1, int(params[c, 20]) + 1
-        r, g, b = _sample(image, starts[c], width, height, px[c, x], py[c, x], a)
+        width = int(params[c, 19]) + 1
+        r, g, b = _sample(image, starts[c], width, px[c, x], py[c, x], a, columns)
         red += w * r
         green += w * g
         blue += w * b
@@ -174,12 +174,12 @@ def _collect_points(chosen, cameras, e, y, us, ts, twins):
 
 
 @njit(cache=True, nogil=True)
-def sample_colours(chosen, cameras, params, image, starts, first_row, num_sources, a, rgb, source):
+def sample_colours(chosen, cameras, params, image, starts, first_row, num_sources, a, columns, rgb, source):
     """Colours of chosen depths from the cameras that may have seen them.
 
     chosen: (E, h, W) float32 inverse depth, blank < 0;  cameras: (E, h, W) uint64
-    params: (C, 26) float32, `pack_sources`;  image: all images as one flat uint8 buffer
-    starts: (C,) int64 where each begins;  a: Keys' parameter, float32
+    params: (C, 26) float32, `pack_sources`;  image, starts: `pack_images`
+    a: Keys' parameter, float32;  columns: (16,) float32 scratch
     rgb: (E, h, W, 3) uint8, source: (E, h, W) uint8 camera of least cost, 255 where there is no
     colour; both changed in place, both start as blank (0, 255)
 
@@ -212,7 +212,7 @@ def sample_colours(chosen, cameras, params, image, starts, first_row, num_source
                 found = _rank(cameras[e, y, x], cost, i, num_sources + 1, best)
                 if found == 0:
                     continue
-                r, g, b = _blend(found, num_sources, best, i, px, py, cost, params, image, starts, a)
+                r, g, b = _blend(found, num_sources, best, i, px, py, cost, params, image, starts, a, columns)
                 source[e, y, x] = np.uint8(best[0])
                 rgb[e, y, x, 0], rgb[e, y, x, 1] = _to_byte(r), _to_byte(g)
                 rgb[e, y, x, 2] = _to_byte(b)

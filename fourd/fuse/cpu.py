@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 
-from fourd.fuse import colour_kernels, kernels
+from fourd.fuse import colour_kernels, reduce_kernels, splat_kernels
 from fourd.fuse.geometry import DisparityMap, Sources, source_rows
 from fourd.fuse.options import KEYS_A, FuseOptions, FusionRules
 
@@ -34,25 +34,24 @@ class CpuBackend:
         self._params = colour_kernels.pack_sources(sources)
         self._options = options
         self._height = size[1]
-        lengths = [image.size for image in sources.images]
-        self._starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
-        self._pixels = np.concatenate([image.ravel() for image in sources.images])
-        self._layers = _scratch("layers", (2, num_pairs, rows, size[0]), np.float32)
-        self._keys = _scratch("keys", (2, rows, size[0]), np.uint64)
+        self._pixels, self._starts = colour_kernels.pack_images(sources.images)
+        self._layers = _scratch("layers", (num_pairs, rows, size[0]), np.int64)
+        self._keys = _scratch("keys", (2, rows, size[0]), np.int64)
 
     def layer(self, index: int, maps: tuple[DisparityMap, DisparityMap], rows: tuple[int, int]) -> int:
         """Project pair `index` into rows [first, last) of the cost volume. Returns the points used."""
         height = rows[1] - rows[0]
-        keys = self._keys[:, :height]
-        keys[:] = 0
-        points = sum(self._splat(maps[side], rows, keys[side]) for side in (0, 1))
-        inverse_depth, sigma = self._layers[:, index, :height]
-        kernels.merge_maps(keys[0], keys[1], np.float32(self._options.tolerance), inverse_depth, sigma)
+        left, right = self._keys[:, :height]
+        self._keys[:, :height] = 0
+        points = self._splat(maps[0], rows, left) + self._splat(maps[1], rows, right)
+        reduce_kernels.merge_maps(
+            left, right, np.float32(self._options.tolerance), self._layers[index, :height]
+        )
         return points
 
     def _splat(self, m: DisparityMap, rows: tuple[int, int], keys: np.ndarray) -> int:
         scalars = np.array([m.disparity_at_infinity, m.inverse_depth_per_px, m.sigma_px], np.float32)
-        return kernels.splat_map(
+        return splat_kernels.splat_map(
             m.disparity, m.confidence, m.A, m.b, scalars, source_rows(m, rows, self._height), rows[0],
             np.float32(self._options.footprint), keys,
         )  # fmt: skip
@@ -61,13 +60,13 @@ class CpuBackend:
         self, masks: np.ndarray, rules: FusionRules, rows: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Chosen inverse depth (4, h, W), cameras (4, h, W) uint64 and counts (2, h, W) uint8."""
-        inverse_depths, sigmas = self._layers[:, :, : rows[1] - rows[0]]
-        shape = inverse_depths.shape[1:]
+        layers = self._layers[:, : rows[1] - rows[0]]
+        shape = layers.shape[1:]
         chosen = _scratch("chosen", (4, *shape), np.float32)
         cameras = _scratch("cameras", (4, *shape), np.uint64)
         counts = _scratch("counts", (2, *shape), np.uint8)
-        kernels.reduce_layers(
-            inverse_depths, sigmas, masks, np.float32(rules.tolerance), np.float32(rules.max_front),
+        reduce_kernels.reduce_layers(
+            layers, masks, np.float32(rules.tolerance), np.float32(rules.max_front),
             rules.numbers(), rules.wanted(), chosen, cameras, counts,
         )  # fmt: skip
         return chosen, cameras, counts
@@ -82,6 +81,7 @@ class CpuBackend:
         source[:] = colour_kernels.NO_SOURCE
         colour_kernels.sample_colours(
             chosen, cameras, self._params, self._pixels, self._starts, first_row,
-            self._options.num_sources, np.float32(KEYS_A), rgb, source,
+            self._options.num_sources, np.float32(KEYS_A),
+            np.empty(16, np.float32), rgb, source,
         )  # fmt: skip
         return rgb, source

@@ -1,6 +1,6 @@
 """Projection, reduction and colours in torch, for any device; same choices as the compiled kernels.
 
-Every operation is float32 and elementwise in the order of `kernels.py`, and the only scatter is a
+Every operation is float32 and elementwise in the order of the compiled kernels, and the only scatter is a
 maximum, so the result does not depend on the device's scheduling.
 """
 
@@ -137,7 +137,7 @@ def _squared(value: float) -> float:
 
 
 def _slope(padded: torch.Tensor, axis: int) -> torch.Tensor:
-    """Slope of (H, W) disparities from a map padded by 1 with NaN (`kernels._slope`)."""
+    """Slope of (H, W) disparities from a map padded by 1 with NaN (`splat_kernels._slope`)."""
     here = padded[1:-1, 1:-1]
     before = padded[1:-1, :-2] if axis == 1 else padded[:-2, 1:-1]
     after = padded[1:-1, 2:] if axis == 1 else padded[2:, 1:-1]
@@ -149,7 +149,7 @@ def _slope(padded: torch.Tensor, axis: int) -> torch.Tensor:
 def _project(
     m: DisparityMap, disparity: torch.Tensor, confidence: torch.Tensor, footprint: float
 ) -> tuple[dict[str, torch.Tensor], int]:
-    """Patches of all valid points of a map (`kernels._collect_row`, `_project_row`), and their number."""
+    """Patches of all valid points of a map (`splat_kernels._project`), and their number."""
     padded = torch.nn.functional.pad(disparity, (1, 1, 1, 1), value=float("nan"))
     per_px = float(m.inverse_depth_per_px)
     s = (disparity - float(m.disparity_at_infinity)) * per_px
@@ -190,7 +190,7 @@ def _project(
 def _splat(
     patches: dict[str, torch.Tensor], rows: tuple[int, int], width: int, footprint: float
 ) -> torch.Tensor:
-    """(h, W) int64 keys, 0 = blank (`kernels._key`); positive, so signed order is theirs."""
+    """(h, W) int64 keys, 0 = blank (`splat_kernels._key`); positive, so signed order is theirs."""
     height = rows[1] - rows[0]
     u, v = patches["u"], patches["v"]
     left, right = torch.ceil(u - patches["reach_u"]), torch.floor(u + patches["reach_u"])
@@ -224,7 +224,7 @@ def _unpack(keys: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _merge(left: torch.Tensor, right: torch.Tensor, tolerance: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """One layer from the keys of two maps (`kernels.merge_maps`)."""
+    """One layer from the keys of two maps (`reduce_kernels.merge_maps`)."""
     a, sigma_a = _unpack(left)
     b, sigma_b = _unpack(right)
     va, vb = sigma_a * sigma_a, sigma_b * sigma_b
@@ -239,7 +239,7 @@ def _merge(left: torch.Tensor, right: torch.Tensor, tolerance: float) -> tuple[t
 def _reduce(
     t: torch.Tensor, sigma: torch.Tensor, bits: torch.Tensor, rules: FusionRules
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """`kernels.reduce_layers` on (P, h, W) layers; P passes over P layers."""
+    """`reduce_kernels.reduce_layers` on (P, h, W) layers; P passes over P layers."""
     order = torch.sort(sigma, dim=0, stable=True).indices
     order = order.gather(0, torch.sort(t.gather(0, order), dim=0, stable=True, descending=True).indices)
     t, sigma, masks = t.gather(0, order), sigma.gather(0, order), bits[order]

@@ -1,5 +1,6 @@
 """Files of stage stereo (docs/formats.md): rectification of a pair, disparity of a pair and chunk."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -124,3 +125,14 @@ def encode_confidence(confidence: np.ndarray) -> np.ndarray:
 def decode_confidence(levels: np.ndarray) -> np.ndarray:
     """Inverse of `encode_confidence`: (H, W) float32."""
     return levels / np.float32(255)
+
+
+def refused_pairs(paths: Sequence[Path]) -> dict[str, str]:
+    """Pair -> why it is not matched, of rectification files; usable pairs and absent files are left out."""
+    refused = {}
+    for path in paths:
+        if path.is_file():
+            status = Archive(path).meta["status"]
+            if status != "ok":
+                refused[path.stem] = status
+    return refused

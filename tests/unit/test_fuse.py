@@ -12,8 +12,8 @@ from fourd.errors import InputError
 from fourd.fuse import ESTIMATES, FuseOptions, fuse_view
 from fourd.fuse.cpu import CpuBackend
 from fourd.fuse.geometry import make_sources, maps_of_pair, source_rows
-from fourd.fuse.kernels import reduce_layers
 from fourd.fuse.options import FusionRules
+from fourd.fuse.reduce_kernels import reduce_layers
 from fourd.fuse.reference import F, bicubic, keys_weights, reduce_pixel
 from fourd.geometry import look_at
 from tests.unit.fuse_scene import (
@@ -189,9 +189,11 @@ def test_sigma_grows_with_the_square_of_depth_and_falls_with_confidence():
         pair, left_confidence=pair.left_confidence / 2, right_confidence=pair.right_confidence * 0
     )
     backend.layer(0, maps_of_pair(half, rotated), (0, SIZE[1]))
-    inverse_depth, sigma = backend._layers[:, 0]
+    keys = backend._layers[0]
+    sigma = (0xFFFFFFFF - (keys[keys > 0] & 0xFFFFFFFF)).astype(np.uint32).view(np.float32)
     expected = 0.25 / 0.5 / (pair.K_left[0, 0] * pair.baseline)
-    np.testing.assert_allclose(sigma[inverse_depth >= 0], expected, rtol=1e-5)
+    assert sigma.size
+    np.testing.assert_allclose(sigma, expected, rtol=1e-5)
 
 
 RULES = FusionRules(2.0, 3, 2, 0.4, 1, ESTIMATES)
@@ -201,13 +203,14 @@ SAMPLES = st.lists(
 
 
 def reduce_with_kernel(samples, rules):
-    layers = np.array([[t for t, *_ in samples], [s for _, s, _ in samples]], np.float32)[..., None, None]
+    bits = np.array([[t for t, *_ in samples], [s for _, s, _ in samples]], np.float32).view(np.uint32)
+    layers = (bits[0].astype(np.int64) << 32 | (0xFFFFFFFF - bits[1]).astype(np.int64))[:, None, None]
     masks = np.array([mask for *_, mask in samples], np.uint64)
     chosen, cameras = np.empty((4, 1, 1), np.float32), np.empty((4, 1, 1), np.uint64)
     counts = np.empty((2, 1, 1), np.uint8)
     limits = np.float32(rules.tolerance), np.float32(rules.max_front)
     arguments = masks, *limits, rules.numbers(), rules.wanted(), chosen, cameras, counts
-    reduce_layers(layers[0], layers[1], *arguments)
+    reduce_layers(layers, *arguments)
     return chosen[:, 0, 0], cameras[:, 0, 0], counts[:, 0, 0]
 
 
