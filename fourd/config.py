@@ -74,27 +74,21 @@ def validate(document: Mapping[str, Any], schema: Mapping[str, Any], where: str)
         raise InputError(_explain(errors[0], where))
 
 
-def read_words(document: Mapping[str, Any], schema: Mapping[str, Any]) -> dict[str, Any]:
+def read_words(value: Any, schema: Mapping[str, Any]) -> Any:
     """A copy in which text stands for a number, list or truth value where the schema wants one.
 
     The engine hands nested values of `--config 'fuse={min_pairs: 4}'` over as text.
     """
-    read = {}
-    for key, value in document.items():
-        entry = schema.get("properties", {}).get(key, schema.get("additionalProperties"))
-        entry = entry if isinstance(entry, Mapping) else {}
-        kinds = entry.get("type", "string" if "enum" in entry else ())
-        if isinstance(value, Mapping):
-            read[key] = read_words(value, entry)
-        elif isinstance(value, list):
-            read[key] = list(
-                read_words(dict(enumerate(value)), {"additionalProperties": entry.get("items")}).values()
-            )
-        elif isinstance(value, str) and kinds and "string" not in kinds:
-            read[key] = yaml.safe_load(value)
-        else:
-            read[key] = value
-    return read
+    if isinstance(value, Mapping):
+        properties, others = schema.get("properties", {}), schema.get("additionalProperties")
+        fallback = others if isinstance(others, Mapping) else {}
+        return {key: read_words(item, properties.get(key, fallback)) for key, item in value.items()}
+    if isinstance(value, list):
+        return [read_words(item, schema.get("items", {})) for item in value]
+    kinds = schema.get("type", ())
+    if isinstance(value, str) and kinds and "string" not in kinds:
+        return yaml.safe_load(value)
+    return value
 
 
 def _explain(error: jsonschema.ValidationError, where: str) -> str:
