@@ -1,4 +1,4 @@
-"""The picture of the README from a finished demo: `python -m benches.readme_picture`."""
+"""The pictures of the README from a finished demo: `python -m benches.readme_picture`."""
 
 import argparse
 from pathlib import Path
@@ -12,6 +12,7 @@ from fourd.io import read_image
 FILMED = ("cam01", "cam03", "cam06", "cam07")
 FILM_FRAMES = (0, 10, 19, 29)
 LABEL_HEIGHT = 22
+WIDTH = 1600
 
 
 def labelled(path: Path, text: str) -> np.ndarray:
@@ -19,21 +20,25 @@ def labelled(path: Path, text: str) -> np.ndarray:
     return np.concatenate([label_image(text, (image.shape[1], LABEL_HEIGHT)), image])
 
 
+def write_jpg(path: Path, picture: np.ndarray) -> None:
+    scale = WIDTH / picture.shape[1]
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(path), small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--results", type=Path, default=Path("results/demo"))
     parser.add_argument("--frames", type=Path, default=Path("data/demo/frames"))
-    parser.add_argument("--output", type=Path, default=Path("docs/demo.jpg"))
+    parser.add_argument("--output", type=Path, default=Path("docs"))
     args = parser.parse_args()
     film = {int(p.stem): p for p in (args.results / "render" / "freeze_time").glob("*/*.png")}
     rows = [
         [labelled(args.frames / cam / "000015.png", f"filmed by {cam}") for cam in FILMED],
         [labelled(film[frame], f"rendered: time frozen, view {frame + 1} of 30") for frame in FILM_FRAMES],
     ]
-    picture = tile_images(rows)
-    scale = 1600 / picture.shape[1]
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    cv2.imwrite(str(args.output), small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+    write_jpg(args.output / "demo.jpg", tile_images(rows))
+    write_jpg(args.output / "heldout.jpg", read_image(args.results / "evaluate" / "contact_sheet.png"))
 
 
 if __name__ == "__main__":
