@@ -69,11 +69,18 @@ def test_no_file_is_half_written(finished: Workspace) -> None:
     assert [path for path in results(finished).rglob("*") if ".tmp" in path.name] == []
 
 
-def test_without_a_disk_budget_intermediates_are_removed(finished: Workspace, tmp_path: Path) -> None:
+@pytest.mark.parametrize("num_cameras", [2, 3])
+def test_few_cameras_without_a_disk_budget(finished: Workspace, tmp_path: Path, num_cameras: int) -> None:
+    """Two cameras are one pair, three are three: a film all the same, and no intermediate is left."""
     workspace = Workspace(tmp_path)
-    scene = tiny_scene(num_cameras=3, num_frames=2)
+    scene = tiny_scene(num_cameras, num_frames=2)
     scene |= {"heldout": [], "labels": None}
-    scene["settings"] |= {"keep_gb": 0, "trajectories": {"hold_view": {"kind": "hold", "num_frames": 2}}}
+    # Neighbours 11 degrees apart, as in the demo.
+    scene["settings"] |= {
+        "keep_gb": 0,
+        "demo": {"arc_deg": 11 * (num_cameras - 1)},
+        "trajectories": {"hold_view": {"kind": "hold", "num_frames": 2}},
+    }
     workspace.write_scene("demo", scene)
     result = workspace.snakemake("--cores", "2", "render_all")
     assert result.returncode == 0, result.stdout[-4000:]

@@ -91,32 +91,60 @@ def test_image_round_trip_is_rgb(tmp_path: Path) -> None:
         io.read_image(tmp_path / "no.png")
 
 
-def test_full_disk_is_a_sentence_and_keeps_what_was_there(tmp_path: Path) -> None:
-    """A limit on file size fails a write half way, as a full disk does."""
-    program = (
-        "import numpy as np, sys\n"
-        "from fourd import io\n"
-        "from fourd.cli import run_stage\n"
-        "def main(argv):\n"
-        "    with io.ArchiveWriter(argv[0]) as archive:\n"
-        "        archive.add('x', np.zeros(1_000_000))\n"
-        "sys.exit(run_stage(main, sys.argv[1:]))\n"
+WRITE_EIGHT_MEGABYTES = """
+import sys
+import numpy as np
+from fourd import io
+from fourd.cli import run_stage
+
+def main(argv):
+    with io.ArchiveWriter(argv[0]) as archive:
+        archive.add("x", np.zeros(1_000_000))
+
+sys.exit(run_stage(main, sys.argv[1:]))
+"""
+
+
+def write_too_much(target: Path, **how: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", WRITE_EIGHT_MEGABYTES, str(target)],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[2],
+        **how,  # type: ignore[call-overload]
     )
+
+
+def check_refused(result: subprocess.CompletedProcess[str], target: Path) -> None:
+    assert result.returncode == 3
+    assert "Traceback" not in result.stderr
+    assert "big.npz" in result.stderr
+    assert target.read_text() == "finished work"
+    assert os.listdir(target.parent) == ["big.npz"]
+
+
+def test_file_size_limit_is_a_sentence_and_keeps_what_was_there(tmp_path: Path) -> None:
     target = tmp_path / "big.npz"
     target.write_text("finished work")
 
     def limit_file_size() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 
-    result = subprocess.run(
-        [sys.executable, "-c", program, str(target)],
-        preexec_fn=limit_file_size,
-        capture_output=True,
-        text=True,
-        cwd=Path(__file__).parents[2],
-    )
-    assert result.returncode == 3
-    assert "Traceback" not in result.stderr
-    assert "big.npz" in result.stderr
-    assert target.read_text() == "finished work"
-    assert os.listdir(tmp_path) == ["big.npz"]
+    check_refused(write_too_much(target, preexec_fn=limit_file_size), target)
+
+
+def test_full_disk_is_a_sentence_and_keeps_what_was_there(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "fourd-test", str(disk)]
+    mounted = subprocess.run(mount, capture_output=True, text=True)
+    if mounted.returncode != 0:
+        pytest.skip(f"needs the right to mount a small disk: {mounted.stderr.strip()}")
+    try:
+        target = disk / "big.npz"
+        target.write_text("finished work")
+        result = write_too_much(target)
+        check_refused(result, target)
+        assert "the disk is full" in result.stderr
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
