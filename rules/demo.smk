@@ -79,3 +79,33 @@ rule demo_phone:
         version=fourd_config.stage_version("demo"),
     shell:
         "python -m fourd.demo phones --name {wildcards.demo_cam} --output {output} {params.options} 2> {log}"
+
+
+rule demo_truth:
+    output:
+        files=multiext("data/demo/truth/", "phones.json", "scene.json", "orbit_cameras.json"),
+        folders=directory(["data/demo/truth/depth", "data/demo/truth/orbit"]),
+    log:
+        "<logs>/demo/demo_truth.log",
+    benchmark:
+        "<benchmarks>/demo/demo_truth.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        frames=sorted({0, SCENE.num_frames // 2, SCENE.num_frames - 1}),
+        options=DEMO_FLAGS,
+        version=fourd_config.stage_version("demo"),
+    shell:
+        "python -m fourd.demo truth --only phones scene depth orbit --frames {params.frames}"
+        " --output data/demo/truth {params.options} 2> {log}"
+
+
+# Everything that the demo can give, for measurements: the main job needs frames and cameras only.
+rule demo_all:
+    input:
+        expand("data/demo/{kind}/{cam}", kind=["frames", "truth/labels"], cam=SCENE.cameras),
+        expand("data/demo/phones/{cam}.mp4", cam=SCENE.cameras),
+        rules.demo_cameras.output,
+        rules.demo_truth.output,
+    localrule: True

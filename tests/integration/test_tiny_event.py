@@ -69,6 +69,21 @@ def test_no_file_is_half_written(finished: Workspace) -> None:
     assert [path for path in results(finished).rglob("*") if ".tmp" in path.name] == []
 
 
+def test_demo_gives_phones_and_truth(finished: Workspace) -> None:
+    result = finished.snakemake("--cores", "2", "demo_all")
+    assert result.returncode == 0, result.stdout[-4000:]
+    demo = finished.folder / "data" / "demo"
+    starts = {
+        name: phone["start_time_s"] for name, phone in read_json(demo / "truth/phones.json")["phones"].items()
+    }
+    assert len(set(starts.values())) == 5
+    for name in starts:
+        info = probe_video(demo / "phones" / f"{name}.mp4")
+        assert info.codec == "h264" and info.has_audio
+    assert len(list((demo / "truth" / "orbit").glob("*.png"))) == 12
+    assert len(list((demo / "truth" / "depth").glob("*/*.npz"))) == 5 * 3
+
+
 @pytest.mark.parametrize("num_cameras", [2, 3])
 def test_few_cameras_without_a_disk_budget(finished: Workspace, tmp_path: Path, num_cameras: int) -> None:
     """Two cameras are one pair, three are three: a film all the same, and no intermediate is left."""

@@ -162,3 +162,32 @@ def test_pycolmap_after_opencv_leaves_png_writing_alone(tmp_path):
     )
     subprocess.run([sys.executable, "-c", code, str(folder), str(tmp_path / "x.png")], check=True)
     assert cv2.imread(str(tmp_path / "x.png")) is not None
+
+
+def test_png_can_be_written_in_a_process_that_read_a_colmap_model(tmp_path):
+    """pycolmap imported before OpenCV breaks the next PNG (double free in libpng): the order matters."""
+    program = (
+        "import sys, numpy as np\n"
+        "from pathlib import Path\n"
+        "from fourd.errors import InputError\n"
+        "from fourd.sfm.importers import read_calibration\n"
+        "try:\n"
+        "    read_calibration(sys.argv[1], 'colmap')\n"
+        "except InputError as error:\n"
+        "    print(error)\n"
+        "assert 'pycolmap' in sys.modules\n"
+        "from fourd.io import read_image, write_png\n"
+        "write_png(sys.argv[2], np.zeros((4, 4, 3), np.uint8))\n"
+        "assert read_image(sys.argv[2]).shape == (4, 4, 3)\n"
+    )
+    model = tmp_path / "model"
+    model.mkdir()
+    for name in ("cameras", "images", "points3D"):
+        (model / f"{name}.txt").write_text("# empty\n")
+    result = subprocess.run(
+        [sys.executable, "-c", program, str(model), str(tmp_path / "a.png")],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[2],
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
