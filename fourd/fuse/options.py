@@ -44,9 +44,9 @@ class FuseOptions:
     tolerance: float = 3.0
     min_pairs: int = 3
     min_cameras: int = 2
-    max_front: float = 0.4
+    max_front: float = 1.0
     footprint: float = 0.6
-    num_sources: int = 2
+    num_sources: int = 3
     memory_mb: int = 512
 
 
