@@ -165,7 +165,7 @@ def scene_text(name: str, draft: SceneDraft) -> str:
         "# A network that two cores train in minutes; with a GPU take it out",
         "settings:",
         *few_cameras,
-        "  composition: {num_filters: [8, 8, 8], crop: 192, epochs: 6, learning_rate: 0.0005}",
+        "  composition: {num_filters: [8, 8, 8], crop: 192, epochs: 6, test_input_share: 0.75}",
     ]
     return "\n".join(lines) + "\n"
 

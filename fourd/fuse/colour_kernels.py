@@ -1,4 +1,7 @@
-"""Compiled sampling of colours from the original images through a fused depth; one core, float32."""
+"""Compiled sampling of colours from the original images through a fused depth; one core, float32.
+
+As in `reduce_kernels`, what is called per pixel does not call others with arrays inside a loop.
+"""
 
 from collections.abc import Sequence
 
@@ -9,6 +12,8 @@ from fourd.fuse.geometry import Sources
 from fourd.fuse.options import MIN_SINE_SQUARED, MIN_WEIGHT
 
 NO_SOURCE = np.uint8(255)
+# Bytes that sampling may read beyond the last image.
+_READ_BEYOND = 16
 _ZERO = np.float32(0)
 _ONE = np.float32(1)
 _HALF = np.float32(0.5)
@@ -24,15 +29,32 @@ def pack_sources(sources: Sources) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate(parts, axis=1))
 
 
-def pack_images(images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """All images as one flat uint8 buffer, and (C,) int64 where each begins.
+def packed_size(images: Sequence[np.ndarray]) -> int:
+    """Bytes that `pack_images` fills."""
+    return sum(3 * (image.shape[0] + 3) * (image.shape[1] + 3) for image in images) + _READ_BEYOND
+
+
+def pack_images(images: Sequence[np.ndarray], packed: np.ndarray) -> np.ndarray:
+    """All images into one flat uint8 buffer of `packed_size`. Returns (C,) int64: where each begins.
 
     Edges repeat once above and to the left, twice below and to the right, as bicubic sampling needs.
     Sixteen bytes more may be read after the last.
     """
-    padded = [np.pad(image, ((1, 2), (1, 2), (0, 0)), mode="edge").ravel() for image in images]
-    starts = np.concatenate([[0], np.cumsum([image.size for image in padded])[:-1]]).astype(np.int64)
-    return np.concatenate([*padded, np.zeros(16, np.uint8)]), starts
+    starts = []
+    start = 0
+    for image in images:
+        height, width = image.shape[:2]
+        starts.append(start)
+        stop = start + 3 * (height + 3) * (width + 3)
+        padded = packed[start:stop].reshape(height + 3, width + 3, 3)
+        padded[1:-2, 1:-2] = image
+        padded[1:-2, 0] = image[:, 0]
+        padded[1:-2, -2:] = image[:, -1:]
+        padded[0] = padded[1]
+        padded[-2:] = padded[-3]
+        start = stop
+    packed[start:] = 0
+    return np.array(starts, np.int64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -132,22 +154,11 @@ def _to_byte(value):
     return np.uint8(min(max(np.rint(value), _ZERO), np.float32(255)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _blend(found, num_sources, best, x, px, py, cost, params, image, starts, a, columns):
-    """Weighted mean of the first `num_sources` of `found` ranked sources: r, g, b in 0..255."""
-    red, green, blue, weights = _ZERO, _ZERO, _ZERO, _ZERO
-    for i in range(min(found, num_sources)):
-        c = best[i]
-        w = _ONE / cost[c, x]
-        if found > num_sources:
-            w *= max(_ONE - cost[c, x] / cost[best[num_sources], x], _MIN_WEIGHT)
-        width = int(params[c, 19]) + 1
-        r, g, b = _sample(image, starts[c], width, px[c, x], py[c, x], a, columns)
-        red += w * r
-        green += w * g
-        blue += w * b
-        weights += w
-    return red / weights, green / weights, blue / weights
+@njit(forceinline=True, nogil=True, error_model="numpy")
+def _weight(cost, left_out):
+    """Weight of a source, given the cost of the best that is left out; infinite if none is."""
+    w = _ONE / cost
+    return w * max(_ONE - cost / left_out, _MIN_WEIGHT) if left_out < _NEVER else w
 
 
 @njit(cache=True, nogil=True)
@@ -173,7 +184,7 @@ def _collect_points(chosen, cameras, e, y, us, ts, twins):
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sample_colours(chosen, cameras, params, image, starts, first_row, num_sources, a, columns, rgb, source):
     """Colours of chosen depths from the cameras that may have seen them.
 
@@ -188,7 +199,7 @@ def sample_colours(chosen, cameras, params, image, starts, first_row, num_source
     """
     num_estimates, height, width = chosen.shape
     num_cameras = params.shape[0]
-    best = np.empty(num_sources + 2, np.int64)
+    best, widths = np.empty(num_sources + 2, np.int64), params[:, 19].astype(np.int64) + 1
     twins = np.empty(width, np.int64)
     us, ts = np.empty(width, np.float32), np.empty(width, np.float32)
     px = np.empty((num_cameras, width), np.float32)
@@ -212,7 +223,16 @@ def sample_colours(chosen, cameras, params, image, starts, first_row, num_source
                 found = _rank(cameras[e, y, x], cost, i, num_sources + 1, best)
                 if found == 0:
                     continue
-                r, g, b = _blend(found, num_sources, best, i, px, py, cost, params, image, starts, a, columns)
+                left_out = cost[best[num_sources], i] if found > num_sources else _NEVER
+                red, green, blue, weights = _ZERO, _ZERO, _ZERO, _ZERO
+                for k in range(min(found, num_sources)):
+                    c = best[k]
+                    w = _weight(cost[c, i], left_out)
+                    r, g, b = _sample(image, starts[c], widths[c], px[c, i], py[c, i], a, columns)
+                    red += w * r
+                    green += w * g
+                    blue += w * b
+                    weights += w
                 source[e, y, x] = np.uint8(best[0])
-                rgb[e, y, x, 0], rgb[e, y, x, 1] = _to_byte(r), _to_byte(g)
-                rgb[e, y, x, 2] = _to_byte(b)
+                rgb[e, y, x, 0], rgb[e, y, x, 1] = _to_byte(red / weights), _to_byte(green / weights)
+                rgb[e, y, x, 2] = _to_byte(blue / weights)

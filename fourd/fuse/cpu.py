@@ -34,15 +34,17 @@ class CpuBackend:
         self._params = colour_kernels.pack_sources(sources)
         self._options = options
         self._height = size[1]
-        self._pixels, self._starts = colour_kernels.pack_images(sources.images)
+        self._pixels = _scratch("pixels", (colour_kernels.packed_size(sources.images),), np.uint8)
+        self._starts = colour_kernels.pack_images(sources.images, self._pixels)
         self._layers = _scratch("layers", (num_pairs, rows, size[0]), np.int64)
         self._keys = _scratch("keys", (2, rows, size[0]), np.int64)
+        # Blank before every pair: merging reads them, and leaves them so.
+        self._keys[:] = 0
 
     def layer(self, index: int, maps: tuple[DisparityMap, DisparityMap], rows: tuple[int, int]) -> int:
         """Project pair `index` into rows [first, last) of the cost volume. Returns the points used."""
         height = rows[1] - rows[0]
         left, right = self._keys[:, :height]
-        self._keys[:, :height] = 0
         points = self._splat(maps[0], rows, left) + self._splat(maps[1], rows, right)
         reduce_kernels.merge_maps(
             left, right, np.float32(self._options.tolerance), self._layers[index, :height]

@@ -3,6 +3,9 @@
 A sample is one int64 key (splat_kernels.py): inverse depth in the upper half, sigma in the lower, 0 =
 blank; the greater key is the closer sample. Every sum is taken in the order of the keys, so a result
 depends neither on threads nor on the order of pairs.
+
+A function that is called per pixel must not call another with arrays inside a loop: numba then counts
+references to them with atomic instructions, which took half the time of this module.
 """
 
 import numpy as np
@@ -10,6 +13,8 @@ from numba import njit
 
 BLANK = np.float32(-1)
 _ZERO = np.float32(0)
+# Samples are compared in groups of this many, which fill vector registers.
+_LANES = 8
 _LOW_BITS = np.uint32(0xFFFFFFFF)
 
 
@@ -24,7 +29,7 @@ def _unpack(key):
 def merge_maps(left, right, tolerance, layer):
     """One layer from the two maps of a pair.
 
-    left, right: (h, W) int64 keys;  layer: as they, changed in place
+    left, right: (h, W) int64 keys, blank afterwards;  layer: as they, changed in place
     Where both see one surface: their precision-weighted mean, with the smaller sigma, because one
     image pair made both. Elsewhere the closer.
     """
@@ -32,23 +37,26 @@ def merge_maps(left, right, tolerance, layer):
     squared = tolerance * tolerance
     for y in range(height):
         for x in range(width):
-            a, sa = _unpack(left[y, x])
-            b, sb = _unpack(right[y, x])
+            left_key, right_key = left[y, x], right[y, x]
+            left[y, x] = right[y, x] = 0
+            a, sa = _unpack(left_key)
+            b, sb = _unpack(right_key)
             va, vb = sa * sa, sb * sb
             agree = (a >= _ZERO) & (b >= _ZERO) & ((a - b) * (a - b) <= squared * (va + vb))
             mean = np.float32(b + (a - b) * (vb / (va + vb)))
             # The smaller sigma is the greater lower half.
-            low = max(np.uint32(left[y, x]), np.uint32(right[y, x]))
+            low = max(np.uint32(left_key), np.uint32(right_key))
             merged = np.int64(mean.view(np.uint32)) << 32 | np.int64(low)
-            layer[y, x] = merged if agree else max(left[y, x], right[y, x])
+            layer[y, x] = merged if agree else max(left_key, right_key)
 
 
 @njit(cache=True, nogil=True)
 def _gather_sorted(layers, y, x, masks, keys, t, variance, cameras):
     """Samples of one pixel, the greatest key first: t, squared sigma, cameras. Returns their number.
 
-    The last four are scratch, one longer than the layers. No branch depends on a sample, because
-    nobody could predict it.
+    The last four are scratch, longer than the layers by `_LANES` at least. Whatever follows the
+    samples up to a multiple of `_LANES` agrees with nothing: its variance is NaN. No branch depends on
+    a sample, because nobody could predict it.
     """
     number = np.uint64(0)
     for p in range(layers.shape[0]):
@@ -57,6 +65,8 @@ def _gather_sorted(layers, y, x, masks, keys, t, variance, cameras):
         cameras[number] = masks[p]
         number += np.uint64(key > 0)
     count = np.int64(number)
+    for k in range(_LANES):
+        keys[count + k] = 0
     for i in range(1, count):
         key, mask = keys[i], cameras[i]
         for j in range(i):
@@ -65,30 +75,30 @@ def _gather_sorted(layers, y, x, masks, keys, t, variance, cameras):
             keys[j], cameras[j] = (key if closer else held), (mask if closer else its_mask)
             key, mask = (held if closer else key), (its_mask if closer else mask)
         keys[i], cameras[i] = key, mask
-    for i in range(count):
-        t[i], sigma = _unpack(keys[i])
-        variance[i] = sigma * sigma
+    for first in range(0, count, _LANES):
+        for k in range(_LANES):
+            t[first + k], sigma = _unpack(keys[first + k])
+            variance[first + k] = sigma * sigma
     return count
 
 
 @njit(forceinline=True, nogil=True)
-def _agree(t, variance, i, j, squared):
-    """Whether two samples differ by no more than the tolerance, squared, times their variance."""
-    difference = t[j] - t[i]
-    return difference * difference <= squared * (variance[i] + variance[j])
+def _agree(difference, variances, squared):
+    """Whether two samples differ by no more than the tolerance, squared, times their variances' sum."""
+    return difference * difference <= squared * variances
 
 
 @njit(cache=True, nogil=True)
 def _support(t, variance, cameras, count, index, squared):
-    """Samples that agree with one: how many, how many of them are closer, the cameras of their pairs."""
-    number = closer = 0
-    union = np.uint64(0)
-    for j in range(count):
-        agree = _agree(t, variance, index, j, squared)
-        number += agree
-        closer += agree & (j < index)
-        union |= cameras[j] if agree else np.uint64(0)
-    return number, closer, union
+    """Samples that agree with one: how many, and the cameras of their pairs."""
+    number, union = 0, np.uint64(0)
+    here, spread = t[index], variance[index]
+    for first in range(0, count, _LANES):
+        for k in range(_LANES):
+            agree = _agree(t[first + k] - here, spread + variance[first + k], squared)
+            number += agree
+            union |= cameras[first + k] if agree else np.uint64(0)
+    return number, union
 
 
 @njit(cache=True, nogil=True)
@@ -104,38 +114,24 @@ def _num_bits(mask):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fused(t, variance, count, index, squared):
     """Precision-weighted mean of the samples that agree with one, summed closest first."""
+    here, spread = t[index], variance[index]
     total, weights = _ZERO, _ZERO
     for j in range(count):
-        if _agree(t, variance, index, j, squared):
-            weight = variance[index] / variance[j]
-            total += weight * (t[j] - t[index])
-            weights += weight
-    return max(t[index] + total / weights, _ZERO)
+        difference = t[j] - here
+        agree = _agree(difference, spread + variance[j], squared)
+        weight = spread / variance[j]
+        total += weight * difference if agree else _ZERO
+        weights += weight if agree else _ZERO
+    return max(here + total / weights, _ZERO)
 
 
 @njit(cache=True, nogil=True)
-def _find_consensus(t, variance, cameras, count, squared, max_front, rules):
-    """The closest sample that enough pairs and cameras support, -1 if there is none or it is hidden.
-
-    Returns its index, the number of pairs and their cameras.
-    """
-    for i in range(count if count >= rules[0] else 0):
-        number, closer, union = _support(t, variance, cameras, count, i, squared)
-        if number >= rules[0] and _num_bits(union) >= rules[1]:
-            in_front = np.float32(i - closer)
-            return (-1 if in_front > max_front * np.float32(number) else i), number, union
-    return -1, 0, np.uint64(0)
-
-
-@njit(cache=True, nogil=True)
-def _find_farthest(t, variance, cameras, count, squared, rules):
-    """The farthest sample that enough pairs support; the farthest of all if there is none."""
-    if rules[2] == 1:
-        return count - 1
-    for i in range(count - 1, -1, -1):
-        if _support(t, variance, cameras, count, i, squared)[0] >= rules[2]:
-            return i
-    return count - 1
+def _num_in_front(t, variance, index, squared):
+    """Samples that are closer than one and do not agree with it."""
+    number = 0
+    for j in range(index):
+        number += not _agree(t[j] - t[index], variance[j] + variance[index], squared)
+    return number
 
 
 @njit(cache=True, nogil=True)
@@ -153,8 +149,9 @@ def reduce_layers(layers, masks, tolerance, max_front, rules, wanted, chosen, ca
     and farthest take the consensus' depth and cameras there. Elsewhere they are the sample itself.
     """
     num_pairs, height, width = layers.shape
-    keys, near = np.empty(num_pairs + 1, np.int64), np.empty(num_pairs + 1, np.uint64)
-    t, variance = np.empty(num_pairs + 1, np.float32), np.empty(num_pairs + 1, np.float32)
+    longest = num_pairs + 2 * _LANES
+    keys, near = np.empty(longest, np.int64), np.empty(longest, np.uint64)
+    t, variance = np.empty(longest, np.float32), np.empty(longest, np.float32)
     squared = tolerance * tolerance
     for y in range(height):
         for x in range(width):
@@ -165,7 +162,13 @@ def reduce_layers(layers, masks, tolerance, max_front, rules, wanted, chosen, ca
             counts[0, y, x] = counts[1, y, x] = np.uint8(0)
             if count == 0:
                 continue
-            seed, number, shared_mask = _find_consensus(t, variance, near, count, squared, max_front, rules)
+            seed, number, shared_mask = -1, 0, np.uint64(0)
+            for i in range(count if count >= rules[0] else 0):
+                number, shared_mask = _support(t, variance, near, count, i, squared)
+                if number >= rules[0] and _num_bits(shared_mask) >= rules[1]:
+                    front = np.float32(_num_in_front(t, variance, i, squared))
+                    seed = -1 if front > max_front * np.float32(number) else i
+                    break
             shared = BLANK
             if seed >= 0:
                 shared = _fused(t, variance, count, seed, squared)
@@ -175,11 +178,13 @@ def reduce_layers(layers, masks, tolerance, max_front, rules, wanted, chosen, ca
             for e in range(1, 4):
                 if not wanted[e]:
                     continue
-                index = 0 if e == 1 else (count - 1) // 2
-                if e == 3:
-                    index = _find_farthest(t, variance, near, count, squared, rules)
-                if seed >= 0 and _agree(t, variance, index, seed, squared):
+                index = 0 if e == 1 else ((count - 1) // 2 if e == 2 else count - 1)
+                for i in range(count - 1 if e == 3 and rules[2] > 1 else -1, -1, -1):
+                    if _support(t, variance, near, count, i, squared)[0] >= rules[2]:
+                        index = i
+                        break
+                if seed >= 0 and _agree(t[index] - t[seed], variance[index] + variance[seed], squared):
                     chosen[e, y, x], cameras[e, y, x] = shared, shared_mask
                 else:
                     chosen[e, y, x] = t[index]
-                    cameras[e, y, x] = _support(t, variance, near, count, index, squared)[2]
+                    cameras[e, y, x] = _support(t, variance, near, count, index, squared)[1]

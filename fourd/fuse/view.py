@@ -131,11 +131,12 @@ def _fuse_tile(
     result.counts[:, part] = counts
     for estimate in result.rgb:
         e = ESTIMATES.index(estimate)
-        blank = chosen[e] < 0
+        depth = result.depths[estimate][part]
         with np.errstate(divide="ignore"):
-            result.depths[estimate][part] = np.where(blank, np.float32(np.nan), np.float32(1) / chosen[e])
+            np.divide(np.float32(1), chosen[e], out=depth)
+        np.copyto(depth, np.float32(np.nan), where=chosen[e] < 0)
         result.rgb[estimate][part] = rgb[e]
-        result.valid[estimate][part] = source[e] != 255
+        np.not_equal(source[e], 255, out=result.valid[estimate][part])
     if result.rgb:
         result.source[part] = source[ESTIMATES.index(next(iter(result.rgb)))]
     return num_points
