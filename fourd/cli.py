@@ -100,6 +100,20 @@ def set_num_threads(num_threads: int) -> None:
         sys.modules["torch"].set_num_threads(num_threads)
 
 
+def choose_torch_device(name: str) -> str:
+    """`auto` is the first CUDA device that works, else the CPU. Raises InputError for one that does not."""
+    # Torch takes seconds to import, and most stages do without it.
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError(
+            f"--device: expected a device of this machine, got {name}, but CUDA finds none: use cpu"
+        )
+    return name
+
+
 def run_stage(main: Callable[[Sequence[str] | None], None], argv: Sequence[str] | None = None) -> int:
     """Run a stage's `main`; turn expected failures into one sentence and an exit status.
 

@@ -79,19 +79,6 @@ def with_progress(items: Sequence[ItemT], what: str) -> Iterator[ItemT]:
             last = now
 
 
-def choose_device(name: str) -> str:
-    """`auto` is the first CUDA device that works, else the CPU. Raises InputError for one that does not."""
-    import torch
-
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(
-            f"--device: expected a device of this machine, got {name}, but CUDA finds none: use cpu"
-        )
-    return name
-
-
 def run_frames(
     view_path: Path,
     model_paths: Sequence[Path],
@@ -112,7 +99,7 @@ def run_frames(
     view = read_view(view_path)
     for frame in frames:
         view.at(frame)
-    models = load_models(list(model_paths), choose_device(device))
+    models = load_models(list(model_paths), cli.choose_torch_device(device))
     with (
         contextlib.closing(Archive(foreground_path)) as foreground,
         contextlib.closing(Archive(background_path)) as background,

@@ -140,14 +140,6 @@ def check_options(options: CompositionOptions) -> None:
         raise InputError(f"expected test_input_share in 0..1, got {options.test_input_share}")
 
 
-def choose_device(name: str) -> str:
-    """`auto` is the GPU where there is one. Raises InputError for a GPU that is not there."""
-    has_gpu = torch.cuda.is_available()
-    if name == "cuda" and not has_gpu:
-        raise InputError("expected a GPU for --device cuda, found none: use --device auto or cpu")
-    return "cuda" if has_gpu and name != "cpu" else "cpu"
-
-
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """The command line of this stage."""
     parser = argparse.ArgumentParser(prog="python -m fourd.composition", description=__doc__)
@@ -174,7 +166,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Train one level from files."""
     args = parse(argv)
     cli.set_num_threads(args.threads)
-    device = choose_device(args.device)
+    device = cli.choose_torch_device(args.device)
     # cuBLAS is deterministic only with a fixed workspace, which is read when it starts.
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=device == "cuda")

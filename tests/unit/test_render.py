@@ -187,6 +187,6 @@ def test_film_with_a_gap_is_refused(tmp_path):
 def test_unknown_device_is_named():
     if torch.cuda.is_available():
         pytest.skip("this machine has a CUDA device")
-    assert render.choose_device("auto") == "cpu"
+    assert cli.choose_torch_device("auto") == "cpu"
     with pytest.raises(InputError, match="CUDA finds none"):
-        render.choose_device("cuda:1")
+        cli.choose_torch_device("cuda:1")
