@@ -150,6 +150,10 @@ def labels_of(wildcards):
     return [f"{SCENE.labels}/{wildcards.cam}"] if SCENE.labels else []
 
 
+def label_flags(wildcards):
+    return "".join(flags_from_mapping({"labels": path}) for path in labels_of(wildcards))
+
+
 FILMS = expand(
     "<results>/{scene}/render/{trajectory}.mp4", scene=SCENE.name, trajectory=TRAJECTORIES
 )

@@ -21,7 +21,7 @@ rule evaluate_camera:
         "../envs/vision.yaml"
     threads: 1
     params:
-        labels=lambda wildcards, input: f"--labels {input.labels}" if input.labels else "",
+        labels=label_flags,
         options=options("evaluate"),
         version=fourd_config.stage_version("evaluate"),
     shell:

@@ -53,7 +53,6 @@ rule fuse_foreground:
     params:
         frames=lambda wildcards: frames_of_view(wildcards.view, wildcards.chunk),
         estimates=estimates_of_view,
-        cameras=" ".join(SCENE.inputs),
         options=options("fuse"),
         version=fourd_config.stage_version("fuse"),
     shell:

@@ -124,8 +124,8 @@ def test_samples_weigh_still_and_moving_cameras_alike():
 def test_up_is_up():
     up = estimate_up(list(make_rig().values()))
     assert np.linalg.norm(up) == pytest.approx(1)
-    # The cameras look down by about 9 degrees, and so does their image-up lean.
-    assert up[2] > np.cos(np.radians(12))
+    # The cameras look down by about 9 degrees, but they are held level; what is left is the tie-break.
+    assert up[2] > np.cos(np.radians(1.5))
 
 
 def test_up_of_cameras_that_cancel_is_the_first_ones():
