@@ -1,5 +1,4 @@
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
@@ -13,51 +12,9 @@ from fourd.video import (
     probe_video,
     read_video_frames,
 )
+from tests.unit.film_files import constant_ticks, index_of, numbered_picture, write_video
 
-TICKS = Fraction(1, 90000)
 COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255), (0, 0, 0), (200, 120, 40), (10, 200, 180)]
-
-
-def numbered_picture(index: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:
-    """A grey picture that tells its index, with a bright bar at its top left."""
-    picture = np.full((size[1], size[0], 3), 20 + 8 * index, np.uint8)
-    picture[:8, :32] = 255
-    return picture
-
-
-def index_of(picture: np.ndarray) -> int:
-    return round((float(np.median(picture)) - 20) / 8)
-
-
-def write_video(
-    path: Path,
-    ticks: list[int],
-    encoder: str = "libx264",
-    size: tuple[int, int] = (64, 48),
-    rotation: int = 0,
-    hflip: bool = False,
-    gop: int = 8,
-    faststart: bool = False,
-    options: dict[str, str] | None = None,
-) -> Path:
-    flags = {"movflags": "+faststart"} if faststart else {}
-    with av.open(str(path), "w", options=flags) as container:
-        quiet = {"x265-params": "log-level=none"} if encoder == "libx265" else {}
-        stream = container.add_stream(encoder, rate=30, options={"g": str(gop), **quiet, **(options or {})})
-        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        stream.time_base = stream.codec_context.time_base = TICKS
-        if rotation or hflip:
-            stream.set_display_rotation(rotation, hflip=hflip)
-        for index, pts in enumerate(ticks):
-            frame = av.VideoFrame.from_ndarray(numbered_picture(index, size))
-            frame.pts, frame.time_base = pts, TICKS
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
-
-
-def constant_ticks(num_frames: int, fps: int = 30) -> list[int]:
-    return [90000 // fps * i for i in range(num_frames)]
 
 
 def variable_ticks(num_frames: int) -> list[int]:

@@ -1,0 +1,103 @@
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from fourd.align.sampling import match_frames
+from fourd.errors import InputError
+from fourd.flow import CompensationOptions
+from fourd.ingest import IngestOptions, open_camera
+from fourd.ingest.__main__ import run
+from fourd.io import read_json, write_json, write_png
+from fourd.tone import identity_table
+
+SIZE = (160, 120)
+
+
+def picture(index: int) -> np.ndarray:
+    """A still wall with a disc that walks 8 px per frame."""
+    noise = np.random.default_rng(0).integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+    image = np.ascontiguousarray(cv2.GaussianBlur(noise, (0, 0), 1.5))
+    cv2.circle(image, (30 + 8 * index, 60), 12, (250, 40, 40), -1)
+    return image
+
+
+def write_camera(folder: Path, start_s: float = 0.0, num_frames: int = 6, **changes: Any) -> Path:
+    """frames/cam00.json of ten pictures at 30 fps."""
+    for index in range(10):
+        write_png(folder / f"images/{index}.png", picture(index))
+    run("cam00", folder / "images", 30.0, folder / "i.json", folder / "i.csv", IngestOptions(verify=False))
+    ingested = read_json(folder / "i.json")
+    source_frame, dt_s = match_frames(np.array(ingested["pts_s"]), 30, num_frames, start_s)
+    document = {
+        "camera": "cam00", "ingest": ingested, "status": "ok", "offset_s": 0.0, "rate_ppm": 0.0,
+        "sigma_s": 0.0, "method": "given", "fps": 30, "num_frames": num_frames,
+        "source_frame": source_frame.tolist(), "dt_s": dt_s.tolist(), **changes,
+    }  # fmt: skip
+    write_json(folder / "cam00.json", document)
+    return folder / "cam00.json"
+
+
+def test_scene_frames_are_read(tmp_path):
+    with open_camera(write_camera(tmp_path, start_s=0.1)) as reader:
+        assert (reader.camera, reader.size, reader.num_frames, reader.status) == ("cam00", SIZE, 6, "ok")
+        for frame in (0, 5, 2):
+            np.testing.assert_array_equal(reader.read(frame), picture(frame + 3))
+            assert reader.source_frame(frame) == frame + 3
+            assert reader.dt_s(frame) == pytest.approx(0, abs=1e-12)
+        for method in (reader.read, reader.dt_s, reader.source_frame):
+            with pytest.raises(InputError, match=r"cam00: expected a scene frame in 0\.\.5, got 6"):
+                method(6)
+
+
+def test_a_camera_that_is_left_out_says_why(tmp_path):
+    path = write_camera(tmp_path, status="its sound fits no other camera", source_frame=[], dt_s=[])
+    with open_camera(path) as reader:
+        assert reader.num_frames == 0
+        with pytest.raises(InputError, match=r"cam00: .*cam00\.json says: its sound fits no other camera"):
+            reader.read(0)
+
+
+def test_tone_is_applied_and_raw_is_untouched(tmp_path):
+    table = identity_table()
+    table[0] = 255 - table[0]
+    tone = {"frames": [0], "tables": [table.tolist()]}
+    with open_camera(write_camera(tmp_path, tone=tone, compensation=None)) as reader:
+        expected = picture(2)
+        expected[..., 0] = 255 - expected[..., 0]
+        np.testing.assert_array_equal(reader.read(2), expected)
+        np.testing.assert_array_equal(reader.read(2, is_raw=True), picture(2))
+
+
+@pytest.mark.parametrize("start_s", [0.4 / 30, 0.6 / 30], ids=["picture before", "picture after"])
+def test_what_moves_is_brought_to_the_scene_frame(tmp_path, start_s):
+    path = write_camera(tmp_path, start_s=start_s, compensation={})
+    with open_camera(path) as reader:
+        raw, moved = reader.read(2, is_raw=True), reader.read(2)
+        share = start_s * 30
+        assert reader.dt_s(2) == pytest.approx((round(share) - share) / 30)
+        np.testing.assert_array_equal(raw, picture(2 + round(share)))
+    red = (moved[..., 0].astype(int) - moved[..., 1]) > 150
+    at_x = np.nonzero(red)[1].mean()
+    assert abs(at_x - (30 + 8 * (2 + share))) < 1
+    assert (moved != raw).any(axis=2).mean() < 0.2
+
+
+def test_small_differences_in_time_and_the_ends_are_left_alone(tmp_path):
+    settings = {"compensation": {"min_dt_s": 0.015}}
+    with open_camera(write_camera(tmp_path, start_s=0.4 / 30, **settings)) as reader:
+        np.testing.assert_array_equal(reader.read(2), picture(2))
+    assert CompensationOptions().min_dt_s < 0.3 / 30
+    with open_camera(write_camera(tmp_path, start_s=-0.3 / 30, compensation={})) as reader:
+        np.testing.assert_array_equal(reader.read(0), picture(0))
+
+
+@pytest.mark.parametrize("change", [{"source_frame": None}, {"ingest": {}}, {"compensation": {"speed": 1}}])
+def test_foreign_documents_are_refused(tmp_path, change):
+    with pytest.raises(InputError, match="expected the output of the stage frames or align in"):
+        open_camera(write_camera(tmp_path, **change))
+    (tmp_path / "empty.json").write_text("{}")
+    with pytest.raises(InputError, match="frames or align"):
+        open_camera(tmp_path / "empty.json")
