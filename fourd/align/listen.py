@@ -1,0 +1,180 @@
+"""`listen`: the clocks of all cameras as far as sound alone tells them."""
+
+import dataclasses
+import hashlib
+import itertools
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fourd.align.audio_delay import SoundMatch, estimate_audio_delay
+from fourd.align.clock import CameraClock, Offsets, PairDelay
+from fourd.align.clock_graph import attach_clock, correct_sound_travel, solve_clocks
+from fourd.align.options import AlignOptions
+from fourd.align.sampling import choose_start
+from fourd.align.sound import Sound, check_sound, prepare_sound
+from fourd.audio import read_audio
+from fourd.errors import InputError
+from fourd.io import read_json
+
+log = logging.getLogger(__name__)
+
+# Until cameras are known: standard deviation of how much later one camera hears an event than another,
+# from 1.7 m of difference in distance.
+TRAVEL_SIGMA_S = 5e-3
+TRAVEL_NOTE = (
+    "clocks by sound include the time that sound travels, 1 ms for 0.34 m of difference in distance; sigma_s "
+    f"allows {TRAVEL_SIGMA_S * 1e3:g} ms for it"
+)
+
+
+def read_sounds(ingest_paths: Sequence[Path]) -> tuple[dict[str, Sound], dict[str, str]]:
+    """The sound of every film, and for each camera `ok` or the reason why it has none that can be used.
+
+    ingest_paths: ingest/{cam}.json, in the scene's order: of two equal films the first is used
+    Raises InputError for a film that is missing or damaged.
+    """
+    sounds: dict[str, Sound] = {}
+    status: dict[str, str] = {}
+    first_with: dict[str, str] = {}
+    for path in ingest_paths:
+        document = read_json(path)
+        name = str(document["camera"])
+        film_key = f"film {document['sha256']}"
+        if film_key in first_with:
+            status[name] = f"same recording as {first_with[film_key]}"
+            continue
+        first_with[film_key] = name
+        status[name], sound, sound_key = _read_sound(document)
+        if sound is None:
+            continue
+        if sound_key in first_with:
+            status[name] = f"same recording as {first_with[sound_key]}: their sound is equal in every sample"
+            continue
+        first_with[sound_key] = name
+        sounds[name] = sound
+    return sounds, status
+
+
+def _read_sound(document: Mapping) -> tuple[str, Sound | None, str]:
+    """Status, sound, and a key that equal sounds share."""
+    if document["kind"] != "video" or not document["has_audio"]:
+        return "it has no sound", None, ""
+    audio = read_audio(document["source"])
+    if audio is None:
+        return "it has no sound", None, ""
+    status = check_sound(audio.samples, audio.sample_rate)
+    if status != "ok":
+        return status, None, ""
+    digest = hashlib.sha256(audio.samples.tobytes()).hexdigest()
+    return "ok", prepare_sound(audio.samples, audio.sample_rate, audio.start_s), f"sound {digest}"
+
+
+def compare_sounds(
+    sounds: Mapping[str, Sound], inputs: Sequence[str], heldout: Sequence[str], options: AlignOptions
+) -> list[SoundMatch]:
+    """Matches of all pairs of inputs, and of every held-out camera with every input, in order."""
+    able = [name for name in inputs if name in sounds]
+    pairs = list(itertools.combinations(able, 2))
+    pairs += [(name, other) for other in heldout if other in sounds for name in able]
+    matches = []
+    for left, right in pairs:
+        match = estimate_audio_delay(sounds[left], sounds[right], (left, right), options)
+        delay = match.delay
+        log.info("%s %s: %.4f s, score %.2f: %s", left, right, delay.delay_s, delay.score, delay.status)
+        matches.append(match)
+    return matches
+
+
+def solve_by_sound(
+    pairs: Sequence[PairDelay],
+    status: Mapping[str, str],
+    inputs: Sequence[str],
+    heldout: Sequence[str],
+    travel_sigma_s: float = TRAVEL_SIGMA_S,
+) -> Offsets:
+    """Clocks from delays: the inputs among themselves, then each held-out camera against them.
+
+    status: by camera, why its sound cannot be compared, `ok` where it can
+    travel_sigma_s: doubt that is added for the travel of sound, 0 when `pairs` are corrected for it
+    `start_s` of the result is None.
+    """
+    clocks = {name: CameraClock(0.0, 0.0, 0.0, 0.0, "audio", status[name]) for name in (*inputs, *heldout)}
+    notes = [f"{name}: {clock.status}" for name, clock in clocks.items() if clock.status != "ok"]
+    able = [name for name in inputs if status[name] == "ok"]
+    reference = inputs[0]
+    if able:
+        solved, more = solve_clocks(able, pairs, able[0])
+        clocks |= solved
+        reference = next((name for name in able if solved[name].method == "reference"), reference)
+        notes += more
+        if able[0] != inputs[0]:
+            notes.append(f"times are relative to {reference}: {inputs[0]} has no sound to compare")
+    fixed = {name: clocks[name] for name in inputs}
+    for name in heldout:
+        if status[name] == "ok":
+            clocks[name] = attach_clock(name, pairs, fixed)
+    placed = [name for name, clock in clocks.items() if clock.status == "ok" and name != reference]
+    for name in placed:
+        sigma_s = math.hypot(clocks[name].sigma_s, travel_sigma_s)
+        clocks[name] = dataclasses.replace(clocks[name], sigma_s=sigma_s)
+    if placed and travel_sigma_s > 0:
+        notes.append(TRAVEL_NOTE)
+    return Offsets(reference, clocks, None, tuple(pairs), tuple(notes))
+
+
+def correct_offsets(
+    offsets: Offsets,
+    inputs: Sequence[str],
+    heldout: Sequence[str],
+    centers_m: Mapping[str, np.ndarray],
+    source_m: np.ndarray,
+) -> Offsets:
+    """Clocks by sound once more, without the time that sound travels (see `correct_sound_travel`).
+
+    offsets: those of `run_listen`;  centers_m: (3,) per camera;  source_m: (3,) where the sound comes from
+    """
+    compared = {name for pair in offsets.pairs for name in (pair.left, pair.right)}
+    status = {name: "ok" if name in compared else clock.status for name, clock in offsets.clocks.items()}
+    pairs = correct_sound_travel(offsets.pairs, centers_m, source_m)
+    corrected = solve_by_sound(pairs, status, inputs, heldout, travel_sigma_s=0.0)
+    return dataclasses.replace(corrected, start_s=offsets.start_s)
+
+
+def run_listen(
+    ingest_paths: Sequence[Path],
+    inputs: Sequence[str],
+    heldout: Sequence[str],
+    fps: float,
+    num_frames: int,
+    options: AlignOptions,
+    start_s: float | None = None,
+) -> tuple[Offsets, list[SoundMatch]]:
+    """Clocks by sound, content of align/audio.json, and the comparisons that they rest on.
+
+    ingest_paths: ingest/{cam}.json of all cameras, in the scene's order;  fps, num_frames: of the scene
+    start_s: common time of scene frame 0 where the scene says it; otherwise the earliest from which all
+    placed inputs film, None where there is none
+    Raises InputError for a camera without an ingest file and for a film that cannot be read.
+    """
+    documents = {str(read_json(path)["camera"]): path for path in ingest_paths}
+    missing = [name for name in (*inputs, *heldout) if name not in documents]
+    if missing:
+        raise InputError(
+            f"expected ingest files of all cameras, got none of {', '.join(missing)}: name them all"
+        )
+    sounds, status = read_sounds([documents[name] for name in (*inputs, *heldout)])
+    matches = compare_sounds(sounds, inputs, heldout, options)
+    offsets = solve_by_sound([match.delay for match in matches], status, inputs, heldout)
+    placed = {name: offsets.clocks[name] for name in inputs if offsets.clocks[name].status == "ok"}
+    if start_s is not None or len(placed) < 2:
+        return dataclasses.replace(offsets, start_s=start_s), matches
+    pts = {name: np.asarray(read_json(documents[name])["pts_s"], dtype=np.float64) for name in placed}
+    try:
+        start_s = choose_start(placed, pts, fps, num_frames)
+    except InputError as error:
+        return dataclasses.replace(offsets, notes=(*offsets.notes, str(error))), matches
+    return dataclasses.replace(offsets, start_s=start_s), matches
