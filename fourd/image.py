@@ -122,6 +122,24 @@ def grey_from_rgb(image: np.ndarray) -> np.ndarray:
     return image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
 
 
+def difference_of(image: np.ndarray, changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What `apply_difference` needs to make `changed` of `image`, exactly.
+
+    image, changed: (H, W, 3) uint8. Returns (ceil(H W / 8),) uint8 packed bits of where they differ, and
+    (n, 3) uint8 what stands there.
+    """
+    differs = (image != changed).any(axis=2)
+    return np.packbits(differs), changed[differs]
+
+
+def apply_difference(image: np.ndarray, where: np.ndarray, rgb: np.ndarray) -> np.ndarray:
+    """A copy of (H, W, 3) uint8 `image` with the pixels of `difference_of` put in."""
+    result = image.copy()
+    height, width = image.shape[:2]
+    result[np.unpackbits(where, count=height * width).reshape(height, width).astype(bool)] = rgb
+    return result
+
+
 def label_image(text: str, size: tuple[int, int], left: bool = False) -> np.ndarray:
     """White text on dark grey, as large as fits into (width, height), centred or at the left."""
     width, height = size

@@ -1,17 +1,18 @@
 """Pictures of a camera: by its own frames (`open_source`) and by the scene's (`open_camera`)."""
 
+import contextlib
 import dataclasses
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fourd.errors import InputError
-from fourd.flow import CompensationOptions, compensate_motion
+from fourd.image import apply_difference
 from fourd.ingest.source import read_frame_image
-from fourd.io import read_json
+from fourd.io import Archive, read_json
 from fourd.tone import apply_tone, table_at
 from fourd.video import VideoInfo, VideoReader
 
@@ -120,8 +121,10 @@ class FrameReader:
     Not to be shared between threads.
     """
 
-    def __init__(self, document: Mapping[str, Any], where: Path | str) -> None:
-        """document: align/{cam}.json or frames/{cam}.json;  where: its path.
+    def __init__(
+        self, document: Mapping[str, Any], where: Path | str, archive: Archive | None = None
+    ) -> None:
+        """document: a film on the common clock;  where: its path;  archive: what motion changed in it
 
         Raises InputError if the source changed.
         """
@@ -132,9 +135,7 @@ class FrameReader:
         self._where = where
         self._source_frame = [int(i) for i in document["source_frame"]]
         self._dt_s = [float(dt) for dt in document["dt_s"]]
-        self._rate = 1 + float(document["rate_ppm"]) * 1e-6
-        compensation = document.get("compensation")
-        self._compensation = None if compensation is None else CompensationOptions(**compensation)
+        self._archive = archive
         self._tone = document.get("tone")
 
     @property
@@ -158,11 +159,11 @@ class FrameReader:
         self._check_frame(frame)
         return self._dt_s[frame]
 
-    def read(self, frame: int, is_raw: bool = False) -> np.ndarray:
+    def read(self, frame: int, is_raw: bool = False, is_compensated: bool = True) -> np.ndarray:
         """(H, W, 3) uint8 RGB, as displayed, of a scene frame.
 
         What moves is brought to the frame's time and colours to those of the scene, as the document
-        says; is_raw leaves the camera's picture as it is.
+        says; is_raw leaves the camera's picture as it is, is_compensated=False what moves where it was.
         Raises InputError for a camera that is left out, outside the scene's frames, or if the picture
         cannot be decoded.
         """
@@ -170,22 +171,16 @@ class FrameReader:
         image = self._source.read(self._source_frame[frame])
         if is_raw:
             return image
+        if is_compensated and self._archive is not None and f"{frame:06d}/where" in self._archive:
+            image = apply_difference(image, **self._archive.frame(frame))
         table = table_at(self._tone, frame)
-        image = self._compensate(image, frame)
         return image if table is None else apply_tone(image, table)
 
     def close(self) -> None:
         """Let go of the decoder and the kept pictures."""
         self._source.close()
-
-    def _compensate(self, image: np.ndarray, frame: int) -> np.ndarray:
-        """Move what moves to the frame's time, if there is a picture on its other side."""
-        options, dt_s, at = self._compensation, self._dt_s[frame], self._source_frame[frame]
-        other = at - 1 if dt_s > 0 else at + 1
-        if options is None or abs(dt_s) <= options.min_dt_s or not 0 <= other < self._source.num_frames:
-            return image
-        gap_s = self._rate * abs(float(self._source.pts_s[at] - self._source.pts_s[other]))
-        return compensate_motion(image, self._source.read(other), dt_s, gap_s, options)
+        if self._archive is not None:
+            self._archive.close()
 
     def _check_frame(self, frame: int) -> None:
         if self.status != "ok":
@@ -205,21 +200,27 @@ def open_source(path: Path | str) -> SourceReader:
 
     Raises InputError if the file is not of this stage or the source is gone or was replaced.
     """
-    return _open(SourceReader, path, "ingest")
+    with _explained(path, "ingest"):
+        return SourceReader(read_json(path), path)
 
 
 def open_camera(path: Path | str) -> FrameReader:
-    """Reader of a camera's pictures by scene frame from frames/{cam}.json or align/{cam}.json.
+    """Reader of a camera's pictures by scene frame, from frames/cameras/{cam}.npz (what moves is brought
+    to the frame's time) or align/cameras/{cam}.json (pictures as they are).
 
     Raises InputError if the file is not of these stages or the source is gone or was replaced.
     """
-    return _open(FrameReader, path, "frames or align")
+    with _explained(path, "frames or align"):
+        if Path(path).suffix != ".npz":
+            return FrameReader(read_json(path), path)
+        archive = Archive(path)
+        return FrameReader(archive.meta, path, archive)
 
 
-def _open(reader: Any, path: Path | str, stage: str) -> Any:
-    document = read_json(path)
+@contextlib.contextmanager
+def _explained(path: Path | str, stage: str) -> Iterator[None]:
     try:
-        return reader(document, path)
+        yield
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise

@@ -7,10 +7,10 @@ import pytest
 
 from fourd.align.sampling import match_frames
 from fourd.errors import InputError
-from fourd.flow import CompensationOptions
+from fourd.image import difference_of
 from fourd.ingest import IngestOptions, open_camera
 from fourd.ingest.__main__ import run
-from fourd.io import read_json, write_json, write_png
+from fourd.io import ArchiveWriter, read_json, write_json, write_png
 from fourd.tone import identity_table
 
 SIZE = (160, 120)
@@ -71,30 +71,21 @@ def test_tone_is_applied_and_raw_is_untouched(tmp_path):
         np.testing.assert_array_equal(reader.read(2, is_raw=True), picture(2))
 
 
-@pytest.mark.parametrize("start_s", [0.4 / 30, 0.6 / 30], ids=["picture before", "picture after"])
-def test_what_moves_is_brought_to_the_scene_frame(tmp_path, start_s):
-    path = write_camera(tmp_path, start_s=start_s, compensation={})
-    with open_camera(path) as reader:
-        raw, moved = reader.read(2, is_raw=True), reader.read(2)
-        share = start_s * 30
-        assert reader.dt_s(2) == pytest.approx((round(share) - share) / 30)
-        np.testing.assert_array_equal(raw, picture(2 + round(share)))
-    red = (moved[..., 0].astype(int) - moved[..., 1]) > 150
-    at_x = np.nonzero(red)[1].mean()
-    assert abs(at_x - (30 + 8 * (2 + share))) < 1
-    assert (moved != raw).any(axis=2).mean() < 0.2
+def test_pixels_that_motion_changes_come_from_the_archive(tmp_path):
+    document = read_json(write_camera(tmp_path))
+    moved = picture(2)
+    moved[5:9, 7:11] = (1, 2, 3)
+    where, rgb = difference_of(picture(2), moved)
+    with ArchiveWriter(tmp_path / "cam00.npz", {**document, "tone": None}) as writer:
+        writer.add_frame(2, where=where, rgb=rgb)
+    with open_camera(tmp_path / "cam00.npz") as reader:
+        np.testing.assert_array_equal(reader.read(2), moved)
+        np.testing.assert_array_equal(reader.read(1), picture(1))
+        for plain in ({"is_raw": True}, {"is_compensated": False}):
+            np.testing.assert_array_equal(reader.read(2, **plain), picture(2))
 
 
-def test_small_differences_in_time_and_the_ends_are_left_alone(tmp_path):
-    settings = {"compensation": {"min_dt_s": 0.015}}
-    with open_camera(write_camera(tmp_path, start_s=0.4 / 30, **settings)) as reader:
-        np.testing.assert_array_equal(reader.read(2), picture(2))
-    assert CompensationOptions().min_dt_s < 0.3 / 30
-    with open_camera(write_camera(tmp_path, start_s=-0.3 / 30, compensation={})) as reader:
-        np.testing.assert_array_equal(reader.read(0), picture(0))
-
-
-@pytest.mark.parametrize("change", [{"source_frame": None}, {"ingest": {}}, {"compensation": {"speed": 1}}])
+@pytest.mark.parametrize("change", [{"source_frame": None}, {"ingest": {}}])
 def test_foreign_documents_are_refused(tmp_path, change):
     with pytest.raises(InputError, match="expected the output of the stage frames or align in"):
         open_camera(write_camera(tmp_path, **change))
