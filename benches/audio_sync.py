@@ -1,16 +1,17 @@
 """Alignment by sound on generated recordings with true clocks: error, doubt and refusals against time.
 
-    python -m benches.audio_sync --output DIR [--part figures|sweeps|score] [--num-seeds N]
+    python -m benches.audio_sync --output DIR [--part figures|sweeps|rooms|score] [--num-seeds N]
 
-Writes figures.csv (8 phones of one event, solved together), sweeps.csv (one knob at a time on pairs) and
+Writes figures.csv (8 phones of one event, solved together), sweeps.csv (one knob at a time on pairs),
+rooms.csv (exponents of the whitening in rooms and without; how many errors lie within two sigma) and
 score.csv (false accepts and rejects against the threshold). The part `score` also prints the odds that
-fit its recordings best, the origin of WAVE_ODDS and BAND_ODDS.
+fit a second set of recordings best, the origin of WAVE_ODDS and BAND_ODDS.
 """
 
 import argparse
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,24 +22,35 @@ from fourd import io
 from fourd.align import audio_delay
 from fourd.align.audio_delay import SoundMatch, estimate_audio_delay
 from fourd.align.clock import PPM, CameraClock
-from fourd.align.clock_graph import solve_clocks
+from fourd.align.clock_graph import MIN_SIGMA_S, solve_clocks
 from fourd.align.options import AlignOptions
-from fourd.align.sound import prepare_sound
+from fourd.align.sound import Sound, prepare_sound
 
-EVENT_HZ = 48_000
+EVENT_HZ = 32_000
 KINDS = ("noise", "speech", "music", "claps", "mixed")
 # How recordings differ: length, signal to noise, reverberation, microphones, limiter, part muted.
 HARD = {"rt60_s": 0.6, "direct_db": -6.0, "unlike": True}
 RECORDINGS = {
     "1.5 s, 15 dB": (1.5, {"snr_db": 15.0}),
     "3 s, unlike": (3.0, {"snr_db": 10.0, "unlike": True}),
-    "20 s, 10 dB": (20.0, {"snr_db": 10.0}),
-    "20 s, -10 dB": (20.0, {"snr_db": -10.0}),
+    "12 s, 10 dB": (12.0, {"snr_db": 10.0}),
+    "12 s, -10 dB": (12.0, {"snr_db": -10.0}),
     "8 s, clipped": (8.0, {"snr_db": 5.0, "unlike": True, "clip": 1.0, "rt60_s": 0.5, "direct_db": -3.0}),
     "10 s, 40 % muted": (10.0, {"snr_db": 10.0, "muted": 0.4}),
-    "20 s, room": (20.0, {"snr_db": 10.0, **HARD}),
-    "30 s, hall": (30.0, {"snr_db": 10.0, "rt60_s": 1.0, "direct_db": -9.0, "unlike": True}),
+    "12 s, room": (12.0, {"snr_db": 10.0, **HARD}),
+    "15 s, hall": (15.0, {"snr_db": 10.0, "rt60_s": 1.0, "direct_db": -9.0, "unlike": True}),
 }
+ROOMS = {
+    "clean": {"snr_db": 40.0},
+    "10 dB": {"snr_db": 10.0},
+    "-5 dB": {"snr_db": -5.0},
+    "room -6 dB": {"snr_db": 10.0, **HARD},
+    "room -12 dB": {"snr_db": 10.0, **HARD, "direct_db": -12.0},
+    "hall -9 dB": {"snr_db": 10.0, "rt60_s": 1.0, "direct_db": -9.0, "unlike": True},
+    "blocked": {"snr_db": 10.0, "rt60_s": 0.4, "direct_db": -3.0, "unlike": True, "wall": 1.5},
+}
+WHITENINGS = (0.0, 0.5, 0.7, 0.8, 0.9, 1.0)
+ROOM_DURATION_S = 15.0
 
 
 def band_noise(
@@ -117,13 +129,19 @@ def record(
     unlike: bool = False,
     clip: float = 0.0,
     muted: float = 0.0,
+    wall: float = 0.0,
 ) -> np.ndarray:
     """What one phone with that clock records of an event that starts at common time origin_s.
 
     rt60_s, direct_db: its own echo, and the direct sound against it;  unlike: a random frequency response
     clip: limit in units of its rms, 0 for none;  muted: share of the film in which nothing is heard
+    wall: strength of one reflection 2 to 15 ms late against the direct sound, 0.5 to 1.3 times that
     """
     count = int(duration_s * EVENT_HZ)
+    if wall:
+        late = int(rng.uniform(0.002, 0.015) * EVENT_HZ)
+        gain = wall * rng.uniform(0.5, 1.3) * rng.choice([-1, 1])
+        event = event + gain * np.concatenate([np.zeros(late), event[:-late]])
     if rt60_s:
         length = int(rt60_s * EVENT_HZ)
         echo = rng.standard_normal(length) * 10 ** (-3 * np.arange(length) / length)
@@ -146,21 +164,28 @@ def record(
     return np.clip(wave, -limit, limit).astype(np.float32)
 
 
-def compare(
-    kind: str, duration_s: float, setting: dict, seed: int, options: AlignOptions, is_related: bool = True
-) -> tuple[SoundMatch, float, float]:
-    """One pair: its match, the error in the middle of what was compared (s), CPU seconds of matching."""
+def film_pair(
+    kind: str, duration_s: float, setting: dict, seed: int, is_related: bool = True
+) -> tuple[list[Sound], list[CameraClock]]:
+    """Two films of one event, or of two, and their clocks."""
     rng = np.random.default_rng([seed, KINDS.index(kind), int(duration_s * 10), is_related])
     reach = min(10.0, 0.3 * duration_s)
     clocks = [CameraClock(rng.uniform(-reach, reach), rng.uniform(0, 200)) for _ in range(2)]
     events = [make_event(kind, duration_s + 2 * reach, rng)]
     events.append(events[0] if is_related else make_event(kind, duration_s + 2 * reach, rng))
-    left, right = (
+    sounds = [
         prepare_sound(record(event, -reach, clock, duration_s, rng, **setting), EVENT_HZ)
         for event, clock in zip(events, clocks, strict=True)
-    )
+    ]
+    return sounds, clocks
+
+
+def match_pair(
+    sounds: Sequence[Sound], clocks: Sequence[CameraClock], options: AlignOptions
+) -> tuple[SoundMatch, float, float]:
+    """The match, its error in the middle of what was compared (s), CPU seconds of matching."""
     start = time.process_time()
-    match = estimate_audio_delay(left, right, ("left", "right"), options)
+    match = estimate_audio_delay(sounds[0], sounds[1], ("left", "right"), options)
     seconds = time.process_time() - start
     delay = match.delay
     true_left_s = clocks[0].own_time(clocks[1].common_time(np.array(delay.time_s)))
@@ -169,53 +194,58 @@ def compare(
 
 
 def summarize(knob: str, value: object, results: Sequence[tuple[SoundMatch, float, float]]) -> dict:
-    """A row: median and 95th percentile of the accepted pairs' errors, ms; how many are off by > 20 ms."""
-    errors = np.array([abs(error) * 1e3 for match, error, _ in results if match.delay.status == "ok"])
-    row = {
+    """A row: of the accepted pairs, errors and doubts, ms; how many are off by > 20 ms."""
+    accepted = [(abs(error), match.delay) for match, error, _ in results if match.delay.status == "ok"]
+    errors = np.array([error * 1e3 for error, _ in accepted])
+    is_within = [error <= 2 * max(delay.sigma_s, MIN_SIGMA_S) for error, delay in accepted]
+    return {
         "knob": knob,
         "value": value,
         "error": float(np.median(errors)) if errors.size else float("nan"),
         "error_p95_ms": float(np.percentile(errors, 95)) if errors.size else float("nan"),
+        "sigma_ms": float(np.median([delay.sigma_s * 1e3 for _, delay in accepted])) if accepted else 0.0,
+        "within_2_sigma": sum(is_within),
         "wrong": int((errors > 20).sum()),
         "refused": len(results) - errors.size,
         "pairs": len(results),
         "seconds": float(np.mean([seconds for *_, seconds in results])),
     }
-    print(
-        "  ".join(f"{k} {v:.4f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True
-    )
-    return row
 
 
-def run_sweeps(num_seeds: int) -> list[dict]:
-    rows = []
-
-    def sweep(knob: str, value: object, duration_s: float, setting: dict, options: AlignOptions) -> None:
+def run_sweeps(num_seeds: int) -> Iterator[dict]:
+    """One knob at a time on pairs of all kinds of events."""
+    noisy = {"snr_db": 10.0}
+    sweeps = [("snr_db", db, 15.0, {"snr_db": db}, 2.0) for db in (20.0, 10.0, 0.0, -10.0, -15.0)]
+    sweeps += [
+        ("duration_s", duration_s, duration_s, noisy, 2.0) for duration_s in (1.0, 1.5, 3.0, 10.0, 60.0)
+    ]
+    sweeps += [("direct_db", db, 15.0, HARD | {"direct_db": db}, 2.0) for db in (6.0, 0.0, -6.0, -12.0)]
+    sweeps += [
+        ("window_s", window_s, 15.0, HARD | noisy, window_s) for window_s in (0.25, 0.5, 1.0, 2.0, 4.0)
+    ]
+    for knob, value, duration_s, setting, window_s in sweeps:
         cases = itertools.product(KINDS, range(num_seeds))
-        results = [compare(kind, duration_s, setting, seed, options) for kind, seed in cases]
-        rows.append(summarize(knob, value, results))
+        pairs = (film_pair(kind, duration_s, setting, seed) for kind, seed in cases)
+        results = [match_pair(*pair, AlignOptions(window_s=window_s)) for pair in pairs]
+        yield summarize(knob, value, results)
 
-    default = AlignOptions()
-    for snr_db in (20.0, 10.0, 0.0, -10.0, -15.0):
-        sweep("snr_db", snr_db, 20, {"snr_db": snr_db}, default)
-    for duration_s in (1.0, 1.5, 3.0, 10.0, 60.0):
-        sweep("duration_s", duration_s, duration_s, {"snr_db": 10.0}, default)
-    for direct_db in (6.0, 0.0, -6.0, -12.0):
-        sweep("direct_db", direct_db, 20, HARD | {"direct_db": direct_db}, default)
-    for window_s in (0.25, 0.5, 1.0, 2.0, 4.0):
-        sweep("window_s", window_s, 20, HARD, AlignOptions(window_s=window_s))
+
+def run_rooms(num_seeds: int) -> Iterator[dict]:
+    """Exponents of the whitening in rooms and without."""
     chosen = audio_delay.WHITENING
-    for whitening in (0.0, 0.5, 0.7, 0.8, 0.9, 1.0):
-        audio_delay.WHITENING = whitening
-        sweep("whitening", whitening, 20, HARD, default)
-        sweep("whitening, no room", whitening, 20, {"snr_db": -6.0}, default)
+    for name, setting in ROOMS.items():
+        cases = itertools.product(KINDS, range(num_seeds))
+        pairs = [film_pair(kind, ROOM_DURATION_S, setting, 300 + seed) for kind, seed in cases]
+        for whitening in WHITENINGS:
+            audio_delay.WHITENING = whitening
+            yield {"room": name} | summarize(
+                "whitening", whitening, [match_pair(*pair, AlignOptions()) for pair in pairs]
+            )
     audio_delay.WHITENING = chosen
-    return rows
 
 
-def run_figures(num_seeds: int, num_phones: int = 8, duration_s: float = 60.0) -> list[dict]:
+def run_figures(num_seeds: int, num_phones: int = 8, duration_s: float = 60.0) -> Iterator[dict]:
     """Events of each kind filmed by 8 phones: +-10 s, 0 to 200 ppm, own noise at 10 dB."""
-    rows = []
     names = [f"cam{index:02d}" for index in range(num_phones)]
     for kind, seed in itertools.product(KINDS, range(num_seeds)):
         rng = np.random.default_rng([seed, 1000, KINDS.index(kind)])
@@ -238,7 +268,7 @@ def run_figures(num_seeds: int, num_phones: int = 8, duration_s: float = 60.0) -
             true_s = truth[names[0]].own_time(truth[name].common_time(own_s))
             errors.append(float(np.abs(clocks[name].common_time(own_s) - true_s).max()) * 1e3)
             rates.append(abs(clocks[name].rate_ppm - (np.diff(true_s)[0] / duration_s - 1) / PPM))
-        row = {
+        yield {
             "kind": kind,
             "seed": seed,
             "error": float(np.median(errors)),
@@ -247,28 +277,36 @@ def run_figures(num_seeds: int, num_phones: int = 8, duration_s: float = 60.0) -
             "placed": sum(clock.status == "ok" for clock in clocks.values()),
             "seconds": seconds,
         }
-        rows.append(row)
-        print(
-            "  ".join(f"{k} {v:.4f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()),
-            flush=True,
-        )
-    return rows
 
 
-def run_score(num_seeds: int) -> list[dict]:
-    """False accepts (unrelated, or off by 20 ms) and false rejects against the threshold."""
-    results = []
+def run_score(num_seeds: int) -> Iterator[dict]:
+    """False accepts (unrelated, or off by 20 ms) and false rejects against the threshold.
+
+    The odds are fitted to the seeds from 100 on, the rows are of those from 200 on.
+    """
+    for_fit, for_test = [], []
     for name, (duration_s, setting) in RECORDINGS.items():
-        for kind, seed, is_related in itertools.product(KINDS, range(num_seeds), (True, False)):
-            match, error, _ = compare(kind, duration_s, setting, 100 + seed, AlignOptions(), is_related)
-            results.append((name, match, is_related, is_related and abs(error) < 0.02))
-    rows = []
-    for threshold in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95):
-        accepted = [
-            (related, right) for _, match, related, right in results if match.delay.score >= threshold
-        ]
-        num_related = sum(related for _, _, related, _ in results)
-        row = {
+        for results, first_seed in ((for_fit, 100), (for_test, 200)):
+            for kind, seed, is_related in itertools.product(KINDS, range(num_seeds), (True, False)):
+                pair = film_pair(kind, duration_s, setting, first_seed + seed, is_related)
+                match, error, _ = match_pair(*pair, AlignOptions())
+                results.append((name, match, is_related, is_related and abs(error) < 0.02))
+        yield from _count_mistakes(name, [result for result in for_test if result[0] == name])
+    yield from _count_mistakes("all", for_test)
+    for is_wave, columns in ((True, (0, 2, 3)), (False, (0, 1))):
+        mine = [(match.evidence, right) for _, match, _, right in for_fit if match.is_wave == is_wave]
+        features = np.array([[1.0, *(evidence[column] for column in columns)] for evidence, _ in mine])
+        odds = fit_odds(features, np.array([right for _, right in mine], dtype=float))
+        print("odds by", "waveforms" if is_wave else "bands", np.round(odds, 2), "from", len(mine))
+
+
+def _count_mistakes(name: str, results: Sequence[tuple[str, SoundMatch, bool, bool]]) -> Iterator[dict]:
+    """A row per threshold: recordings, match, whether related, whether right."""
+    num_related = sum(related for _, _, related, _ in results)
+    for threshold in (0.1, 0.3, 0.5, 0.7, 0.9):
+        accepted = [(rel, right) for _, match, rel, right in results if match.delay.score >= threshold]
+        yield {
+            "recordings": name,
             "threshold": threshold,
             "unrelated_accepted": sum(not related for related, _ in accepted),
             "unrelated": len(results) - num_related,
@@ -276,18 +314,6 @@ def run_score(num_seeds: int) -> list[dict]:
             "related_refused": num_related - sum(related for related, _ in accepted),
             "related": num_related,
         }
-        rows.append(row)
-        print("  ".join(f"{k} {v}" for k, v in row.items()))
-    for name in RECORDINGS:
-        mine = [(match, related) for other, match, related, _ in results if other == name]
-        refused = sum(related and match.delay.status != "ok" for match, related in mine)
-        print(f"{name}: {refused} of {len(mine) // 2} refused")
-    for is_wave, columns in ((True, (0, 2, 3)), (False, (0, 1))):
-        mine = [(match.evidence, right) for _, match, _, right in results if match.is_wave == is_wave]
-        features = np.array([[1.0, *(evidence[column] for column in columns)] for evidence, _ in mine])
-        odds = fit_odds(features, np.array([right for _, right in mine], dtype=float))
-        print("odds by", "waveforms" if is_wave else "bands", np.round(odds, 2))
-    return rows
 
 
 def fit_odds(features: np.ndarray, is_right: np.ndarray) -> np.ndarray:
@@ -302,14 +328,19 @@ def fit_odds(features: np.ndarray, is_right: np.ndarray) -> np.ndarray:
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parts = {"figures": run_figures, "sweeps": run_sweeps, "score": run_score}
+    parts = {"figures": run_figures, "sweeps": run_sweeps, "rooms": run_rooms, "score": run_score}
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--part", choices=parts, nargs="*", default=list(parts))
     parser.add_argument("--num-seeds", type=int, default=3)
     args = parser.parse_args(argv)
     for part in args.part:
-        rows = parts[part](args.num_seeds)
-        io.write_csv(args.output / f"{part}.csv", list(rows[0]), rows)
+        rows = []
+        for row in parts[part](args.num_seeds):
+            shown = (f"{k} {v:.4f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())
+            print("  ".join(shown), flush=True)
+            rows.append(row)
+            # After every row, so that a run that is cut short leaves what it has.
+            io.write_csv(args.output / f"{part}.csv", list(row), rows)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Stage `background`: the static background of every pose of a view (section 3.2 of the paper).
 
-In: views/{view}.json, sfm/cameras.json, disparity/{pair}/samples.npz of all pairs, ingest/{cam}.json.
+In: views/{view}.json, sfm/cameras.json, disparity/{pair}/samples.npz of all pairs, frames/cameras/{cam}.npz.
 Out: background/{view}/{chunk}.npz (docs/formats.md).
 
 What stands still is seen at the same place at all sampled times. Per pose the farthest and the median
@@ -181,7 +181,7 @@ def run(
     cameras_path: Path,
     frames: Sequence[int],
     disparity_paths: Sequence[Path],
-    ingest: Sequence[str],
+    films: Sequence[str],
     fuse_options: FuseOptions,
     options: BackgroundOptions,
     device: str,
@@ -194,8 +194,9 @@ def run(
     if options.num_samples < 1 or options.min_samples < 1 or options.farthest_min_pairs < 1:
         raise InputError(f"expected background settings of 1 or more, got {options}: fix the config")
     view = read_view(view_path)
+    frames = view.frames_of(frames)
     disparities = DisparityFiles(disparity_paths, view.name)
-    pictures = Pictures(ingest, read_cameras(cameras_path), view.name)
+    pictures = Pictures(films, read_cameras(cameras_path), view.name)
     samples = spread(disparities.frames(), options.num_samples)
     same_as = find_equal_poses(view, frames)
     stored = [frame for frame in frames if same_as[frame] == frame]
@@ -239,7 +240,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
     parser.add_argument("--frames", type=int, nargs="+", required=True, help="output frames of the view")
     parser.add_argument("--disparity", type=Path, nargs="*", default=[], help="samples of all pairs")
-    parser.add_argument("--ingest", nargs="*", default=[], help="ingest/{cam}.json, or CAMERA=PATH")
+    parser.add_argument("--films", nargs="*", default=[], help="frames/cameras/{cam}.npz, or CAMERA=PATH")
     parser.add_argument("--device", default="auto", help="auto, cpu or a torch device")
     parser.add_argument("--output", type=Path, required=True)
     add_options(parser, BackgroundOptions)
@@ -251,7 +252,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         args.cameras,
         args.frames,
         args.disparity,
-        args.ingest,
+        args.films,
         options_from_args(FuseOptions, args),
         options_from_args(BackgroundOptions, args),
         choose_device(args.device),

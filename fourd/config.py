@@ -128,25 +128,37 @@ def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class CameraSource:
-    """Where a physical camera's frames come from (scene file, `cameras`)."""
+    """Where a physical camera's frames come from (scene file, `cameras`).
+
+    offset_s: given common time of the first frame, None where it is to be found
+    """
 
     source: str
-    offset_s: float
+    offset_s: float | None
     calibration_name: str
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """The facts of one event, checked."""
+    """The facts of one event, checked.
+
+    clock_is_given: the cameras' offset_s are facts; otherwise sound and motion tell them
+    start_s: common time of scene frame 0, None for the earliest that all cameras film
+    calibration: files with the cameras, none where the videos themselves must tell
+    scale_hint: two cameras and their distance in metres
+    """
 
     name: str
     fps: float
     num_frames: int
+    start_s: float | None
+    clock_is_given: bool
     size: tuple[int, int]
     cameras: dict[str, CameraSource]
     heldout: tuple[str, ...]
     calibration: tuple[str, ...]
     calibration_format: str
+    scale_hint: tuple[str, str, float] | None
     depth_range: tuple[float, float] | None
     labels: str | None
 
@@ -174,19 +186,33 @@ def load_scene(name: str, folder: Path | str = "config/scenes") -> tuple[Scene, 
     schema = load_yaml(SCHEMA_FOLDER / "scene.schema.yaml")
     validate(document, schema, str(path))
     document = fill_defaults(document, schema)
-    cameras = {
-        camera: CameraSource(entry["source"], entry["offset_s"], entry["calibration_name"] or camera)
-        for camera, entry in document["cameras"].items()
-    }
+    clock_is_given = document["clock"] == "given"
+    cameras = {}
+    for camera, entry in document["cameras"].items():
+        offset_s = entry["offset_s"]
+        if offset_s is not None and not clock_is_given:
+            raise InputError(
+                f"{path}: camera {camera} has offset_s {offset_s}, but the clock is to be estimated: add "
+                "`clock: given` if all offsets are known, or take offset_s out"
+            )
+        cameras[camera] = CameraSource(
+            entry["source"],
+            (offset_s or 0.0) if clock_is_given else None,
+            entry["calibration_name"] or camera,
+        )
+    hint = document["scale_hint"]
     scene = Scene(
         name=name,
         fps=document["fps"],
         num_frames=document["num_frames"],
+        start_s=0.0 if clock_is_given and document["start_s"] is None else document["start_s"],
+        clock_is_given=clock_is_given,
         size=tuple(document["size"]),
         cameras=cameras,
         heldout=tuple(document["heldout"]),
         calibration=tuple(document["calibration"]),
         calibration_format=document["calibration_format"],
+        scale_hint=None if hint is None else (*hint["cameras"], hint["metres"]),
         depth_range=None if document["depth_range"] is None else tuple(document["depth_range"]),
         labels=document["labels"],
     )
@@ -205,6 +231,13 @@ def _check_scene(scene: Scene, where: str) -> None:
             f"{where}: expected at least 2 cameras that are not held out, got {len(scene.inputs)}: "
             "depth needs two views, add cameras or hold out fewer"
         )
+    if scene.scale_hint is not None:
+        unknown = [name for name in scene.scale_hint[:2] if name not in scene.cameras]
+        if unknown or scene.scale_hint[0] == scene.scale_hint[1]:
+            raise InputError(
+                f"{where}: scale_hint names {', '.join(scene.scale_hint[:2])}, expected two different "
+                f"cameras of {', '.join(scene.cameras)}"
+            )
     if scene.depth_range is not None and scene.depth_range[0] >= scene.depth_range[1]:
         raise InputError(f"{where}: depth_range is {list(scene.depth_range)}, expected near less than far")
 

@@ -11,6 +11,8 @@ import dataclasses
 import cv2
 import numpy as np
 
+# Times come from sums of seconds: the last bits of a wanted time at the neighbour itself say nothing.
+_TIE = 1e-6
 _NUM_CORNERS = 600
 _MIN_INLIERS = 20
 _MIN_INLIER_SHARE = 0.3
@@ -64,7 +66,7 @@ def compensate_motion(
             f"expected two uint8 pictures of one size, got {image.shape} {image.dtype} and "
             f"{neighbour.shape} {neighbour.dtype}"
         )
-    if not (np.isfinite(dt_s) and np.isfinite(gap_s) and gap_s > 0 and abs(dt_s) <= gap_s):
+    if not (np.isfinite(dt_s) and np.isfinite(gap_s) and gap_s > 0 and abs(dt_s) <= gap_s * (1 + _TIE)):
         raise ValueError(f"expected a gap above 0 and dt_s within it, got gap_s {gap_s} and dt_s {dt_s}")
     result = image.copy()
     if dt_s == 0 or abs(dt_s) < options.min_dt_s:
@@ -76,7 +78,7 @@ def compensate_motion(
     still_cost = _difference(image, registered)
     if not inside.any() or np.median(still_cost[inside]) > _MAX_LIGHT_CHANGE:
         return result
-    share = abs(dt_s) / gap_s
+    share = min(1.0, abs(dt_s) / gap_s)
     flow, moved = _flow_at(share, (image, registered), still_cost, inside, options)
     _render_moved(result, (image, neighbour), neighbour_from_image, share, flow, moved)
     return result

@@ -1,7 +1,8 @@
 """Write a scene file for footage that is there: `python -m fourd.init NAME VIDEO_OR_FOLDER...`.
 
-Probes the inputs and says what to run next. Cameras are called cam00, cam01 ... in the order given,
-unless the sources' own names are of that kind: cam01.mp4 stays cam01.
+Probes the inputs, listens which part of the event all of them film, and says what to run next. Cameras
+are called cam00, cam01 ... in the order given, unless the sources' own names are of that kind: cam01.mp4
+stays cam01.
 """
 
 import argparse
@@ -17,6 +18,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from fourd.align.listen import compare_sounds, solve_by_sound
+from fourd.align.options import AlignOptions
+from fourd.align.sound import check_sound, prepare_sound
+from fourd.audio import read_audio
 from fourd.cli import run_stage
 from fourd.errors import InputError
 from fourd.ingest import Source, probe_source
@@ -32,7 +37,11 @@ MAX_FILM_SIDE = 960
 
 @dataclasses.dataclass(frozen=True)
 class SceneDraft:
-    """What goes into the scene file. cameras: name -> (source as given, calibration name or None)."""
+    """What goes into the scene file.
+
+    cameras: name -> (source as given, calibration name or None)
+    is_synchronized: all sources start together on one clock;  notes: what the user should know
+    """
 
     fps: float
     num_frames: int
@@ -40,6 +49,8 @@ class SceneDraft:
     cameras: dict[str, tuple[str, str | None]]
     heldout: tuple[str, ...]
     calibration: tuple[str, ...]
+    is_synchronized: bool = False
+    notes: tuple[str, ...] = ()
 
 
 def most_common_fps(sources: Sequence[Source]) -> float | None:
@@ -52,6 +63,36 @@ def common_num_frames(sources: Sequence[Source], fps: float) -> int:
     """Frames at `fps` for which every source has a picture, all starting together."""
     durations = [len(s.info.pts_s) / fps if s.files else s.info.pts_s[-1] + 1 / fps for s in sources]
     return max(1, int(np.floor(min(durations) * fps + 1e-3)))
+
+
+def overlapping_num_frames(
+    paths: Sequence[str], sources: Sequence[Source], fps: float
+) -> tuple[int | None, str]:
+    """Frames at `fps` that all sources film together, by their sound, and a sentence about it.
+
+    None where sound does not place every source: then only the run can tell.
+    """
+    sounds, names = {}, [str(path) for path in paths]
+    for name, source in zip(names, sources, strict=True):
+        audio = None if source.files else read_audio(name)
+        if audio is not None and check_sound(audio.samples, audio.sample_rate) == "ok":
+            sounds[name] = prepare_sound(audio.samples, audio.sample_rate, audio.start_s)
+    status = {name: "ok" if name in sounds else "it has no sound that can be compared" for name in names}
+    delays = [match.delay for match in compare_sounds(sounds, names, (), AlignOptions())]
+    clocks = solve_by_sound(delays, status, names, ()).clocks
+    unplaced = [f"{name} ({clock.status})" for name, clock in clocks.items() if clock.status != "ok"]
+    if unplaced:
+        return None, f"Sound does not tell when these started: {'; '.join(unplaced)}. What they show may."
+    starts = [clocks[name].offset_s for name in names]
+    ends = [
+        float(clocks[name].common_time(source.info.pts_s[-1:])[0])
+        for name, source in zip(names, sources, strict=True)
+    ]
+    # One frame less: the first one is put where the pictures of all cameras are nearest in time.
+    num_frames = int(np.floor((min(ends) - max(starts)) * fps))
+    if num_frames < 1:
+        return None, "By their sound these films show no moment in common."
+    return num_frames, f"By their sound all films have {num_frames / fps:.1f} s in common."
 
 
 def film_size(size: tuple[int, int], max_side: int = MAX_FILM_SIDE) -> tuple[int, int]:
@@ -124,11 +165,21 @@ def scene_text(name: str, draft: SceneDraft) -> str:
         for camera, (source, calibrated) in draft.cameras.items()
     ]
     if draft.calibration:
-        calibration = [f"calibration: [{', '.join(map(_scalar, draft.calibration))}]"]
+        calibration = [
+            "# Files or folders with K, R, t of all cameras in one world; the format is recognised.",
+            f"calibration: [{', '.join(map(_scalar, draft.calibration))}]",
+        ]
     else:
         calibration = [
-            "# To do: name the file or folder that has the cameras' K, R and t; nothing runs without it.",
-            f"calibration: [data/{name}/cameras.json]",
+            "# Nothing is known about where the cameras stood: the videos tell. If you have a calibration:",
+            "# calibration: [colmap/sparse/0]",
+        ]
+    if draft.is_synchronized:
+        clock = ["# All sources start together; where one does not, give it its offset_s.", "clock: given"]
+    else:
+        clock = [
+            "# When each camera started is found from sound and motion. If you know: `clock: given`, and",
+            "# offset_s for every camera.",
         ]
     few_cameras = []
     if len(draft.cameras) < FEW_CAMERAS:
@@ -149,15 +200,14 @@ def scene_text(name: str, draft: SceneDraft) -> str:
         "",
         "# Cameras in the order in which they stand, if you know it. Only `source` is required:",
         "#   source: a video file or a folder of numbered images",
-        "#   offset_s: time of the source's first frame on the common clock, seconds (default 0.0)",
         "#   calibration_name: the camera's name in the calibration, where it differs",
         "cameras:",
         *cameras,
+        *clock,
         "",
         "# Cameras that nothing is made from; they show how close the films come to what was there.",
         f"heldout: [{', '.join(draft.heldout)}]",
         "",
-        "# One or more files or folders with K, R, t of all cameras in one world; the format is recognised.",
         *calibration,
         "# Nearest and farthest depth worth seeing, in the calibration's units; estimated if left out.",
         "# depth_range: [1.5, 30]",
@@ -182,6 +232,7 @@ def draft_scene(
     heldout: Sequence[str] = (),
     fps: float | None = None,
     num_frames: int | None = None,
+    is_synchronized: bool = False,
 ) -> SceneDraft:
     """Probe the sources and propose a scene.
 
@@ -199,7 +250,16 @@ def draft_scene(
         raise InputError(f"expected --fps above 0, got {fps}: correct it")
     sources = [probe_source(Path(path), fps or DEFAULT_FPS) for path in paths]
     clock_fps = fps or most_common_fps(sources) or DEFAULT_FPS
-    available = common_num_frames(sources, clock_fps)
+    is_synchronized = is_synchronized or all(source.files for source in sources)
+    available, notes = common_num_frames(sources, clock_fps), ()
+    if not is_synchronized:
+        heard, note = overlapping_num_frames(paths, sources, clock_fps)
+        notes = (note,)
+        if heard is None:
+            notes += (
+                f"num_frames is a guess: {available}, as many as the shortest has; the run says what fits.",
+            )
+        available = heard or available
     if num_frames is not None and not 1 <= num_frames <= available:
         raise InputError(
             f"expected --num-frames in 1..{available}, which is what all sources have at {clock_fps:g} fps, "
@@ -214,6 +274,8 @@ def draft_scene(
         cameras=dict(zip(cameras, zip(paths, calibrated, strict=True), strict=True)),
         heldout=resolve_heldout(heldout, cameras, paths),
         calibration=tuple(calibration),
+        is_synchronized=is_synchronized,
+        notes=notes,
     )
 
 
@@ -232,6 +294,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--fps", type=float, help="of the common clock (default: what most videos have)")
     parser.add_argument("--num-frames", type=int, help="(default: what all sources have)")
+    parser.add_argument("--synchronized", action="store_true", help="all sources start together")
     parser.add_argument("--scenes", type=Path, default=Path("config/scenes"), help="folder to write to")
     parser.add_argument("--force", action="store_true", help="write over an existing scene file")
     args = parser.parse_args(argv)
@@ -243,7 +306,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     path = args.scenes / f"{args.name}.yaml"
     if path.exists() and not args.force:
         raise InputError(f"expected no file at {path}, but there is one: choose another name or give --force")
-    draft = draft_scene(args.sources, args.calibration, args.heldout, args.fps, args.num_frames)
+    draft = draft_scene(
+        args.sources, args.calibration, args.heldout, args.fps, args.num_frames, args.synchronized
+    )
     write_text(path, scene_text(args.name, draft))
     _print_summary(args.name, path, draft)
 
@@ -253,10 +318,9 @@ def _print_summary(name: str, path: Path, draft: SceneDraft) -> None:
         f"{path}: {len(draft.cameras)} cameras, {draft.num_frames} frames at {draft.fps:.6g} fps, films of "
         f"{draft.size[0]} x {draft.size[1]}"
     )
-    if not draft.calibration:
-        print(f"Add the cameras' calibration to {path} (key `calibration`), then run:")
-    else:
-        print("Run:")
+    for note in draft.notes:
+        print(note)
+    print("Run:")
     print(f"  snakemake --cores 2 render_all --config {shlex.quote('scene=' + name)}")
 
 

@@ -97,6 +97,7 @@ def run_frames(
     from fourd.composition.infer import compose_frame, load_models
 
     view = read_view(view_path)
+    frames = view.frames_of(frames)
     for frame in frames:
         view.at(frame)
     models = load_models(list(model_paths), cli.choose_torch_device(device))

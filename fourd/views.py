@@ -24,7 +24,8 @@ from fourd.trajectory import TrajectorySpec, place_cameras, scene_frames, trajec
 
 STAGE_VERSION = 1
 logger = logging.getLogger(__name__)
-ROLES = ("input", "heldout", "virtual")
+LEFT_OUT = "left_out"
+ROLES = ("input", "heldout", "virtual", LEFT_OUT)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,12 +39,21 @@ class ViewFrame:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class View:
-    """A place to film from. role: `input`, `heldout` or `virtual`; size: (width, height) px."""
+    """A place to film from. size: (width, height) px.
+
+    role: `input`, `heldout`, `virtual`, or `left_out`: a camera that could not be placed, without frames
+    status: `ok`, or why it was left out
+    """
 
     name: str
     role: str
     size: tuple[int, int]
     frames: tuple[ViewFrame, ...]
+    status: str = "ok"
+
+    def frames_of(self, wanted: Sequence[int]) -> list[int]:
+        """The wanted output frames, none of a camera that was left out."""
+        return [] if self.role == LEFT_OUT else list(wanted)
 
     def at(self, frame: int) -> ViewFrame:
         """The output frame of that number. Raises InputError if the view has none."""
@@ -63,8 +73,12 @@ def physical_view(
 
     size: of the output; None is the camera's own. Of another aspect than the camera's, the view is
     the largest part around the middle of the camera's picture that has it.
+    A camera that was left out gives a view without frames.
     Raises InputError for an unknown camera, no frames or a frame outside the clip.
     """
+    if name in scene.left_out:
+        logger.warning("camera %s is left out: %s", name, scene.left_out[name])
+        return View(name, LEFT_OUT, size or scene.tracks[scene.inputs[0]].size, (), scene.left_out[name])
     if name not in scene.tracks:
         raise InputError(f"view {name!r}: expected a camera of {', '.join(scene.tracks)}: check the name")
     if not frames:
@@ -116,7 +130,7 @@ def write_view(path: Path | str, view: View) -> None:
         {"frame": entry.frame, "scene_frame": entry.scene_frame, **entry.camera.to_dict()}
         for entry in view.frames
     ]
-    write_json(path, {"role": view.role, "size": list(view.size), "frames": frames})
+    write_json(path, {"role": view.role, "status": view.status, "size": list(view.size), "frames": frames})
 
 
 def read_view(path: Path | str) -> View:
@@ -134,7 +148,7 @@ def read_view(path: Path | str) -> View:
         entries = tuple(
             _read_entry(entry, size, f"{path}, frame {i}") for i, entry in enumerate(document["frames"])
         )
-        view = View(Path(path).stem, document["role"], size, entries)
+        view = View(Path(path).stem, document["role"], size, entries, str(document.get("status", "ok")))
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, IndexError) as error:

@@ -5,7 +5,7 @@ rule estimate_background:
     input:
         view="<results>/{scene}/views/{view}.json",
         cameras="<results>/{scene}/sfm/cameras.json",
-        ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
+        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=sample_disparities,
     output:
         intermediate("foreground", "<results>/{scene}/background/{view}/{chunk}.npz"),
@@ -23,5 +23,5 @@ rule estimate_background:
         version=fourd_config.stage_version("background"),
     shell:
         "python -m fourd.background --view-file {input.view} --cameras {input.cameras}"
-        " --frames {params.frames} --disparity {input.disparity} --ingest {input.ingest}"
+        " --frames {params.frames} --disparity {input.disparity} --films {input.films}"
         " {params.options} --output {output} 2> {log}"

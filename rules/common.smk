@@ -24,6 +24,8 @@ try:
 except InputError as error:
     raise WorkflowError(str(error)) from None
 
+# Where results lie, for flags that name files: pathvars are filled in for inputs and outputs only.
+RESULTS = f"{config['pathvars'].get('results', 'results')}/{SCENE.name}"
 TRAJECTORIES = config["trajectories"]
 CHUNKS = fourd_config.chunk_names(SCENE.num_frames, CHUNK_FRAMES)
 LEVELS = range(fourd_config.num_levels(SCENE, config))
@@ -80,11 +82,34 @@ def view_flags(wildcards):
     return flags_from_mapping(flags)
 
 
-def ingest_of_pair(wildcards):
+def clock_of_camera(wildcards):
+    """Flags that say how a film stands to the common clock: given by the scene file, or from a file."""
+    flags = {"fps": SCENE.fps, "num_frames": SCENE.num_frames}
+    if SCENE.clock_is_given:
+        flags |= {"offset_s": SCENE.cameras[wildcards.cam].offset_s, "start_s": SCENE.start_s}
+    else:
+        flags |= {"offsets": f"{RESULTS}/align/offsets.json"}
+    return flags_from_mapping(flags)
+
+
+def film_cameras_command():
+    """Recover the cameras from the films, or put given ones on the films' own frames."""
+    if SCENE.calibration:
+        names = [f"{cam}={source.calibration_name}" for cam, source in SCENE.cameras.items()]
+        given = {"calibration": SCENE.calibration, "calibration_format": SCENE.calibration_format}
+        return "films " + flags_from_mapping({"camera": names, **given})
+    flags = {"camera": list(SCENE.cameras), "fps": SCENE.fps, "num_frames": SCENE.num_frames}
+    flags |= {"start_s": SCENE.start_s, "scale_hint": SCENE.scale_hint}
+    if not SCENE.clock_is_given:
+        flags |= {"audio": f"{RESULTS}/align/audio.json"}
+    return f"recover {flags_from_mapping(flags)} {options('recover')}"
+
+
+def films_of_pair(wildcards):
     left, right = wildcards.pair.split("-")
     return {
-        "left": f"<results>/{wildcards.scene}/ingest/{left}.json",
-        "right": f"<results>/{wildcards.scene}/ingest/{right}.json",
+        "left": f"<results>/{wildcards.scene}/frames/cameras/{left}.npz",
+        "right": f"<results>/{wildcards.scene}/frames/cameras/{right}.npz",
     }
 
 
@@ -171,12 +196,21 @@ EVALUATION = (
 def print_finished():
     """Where to look, and what was left out, when everything is done."""
     # Imported here: it loads OpenCV, which a dry run does not need.
+    from fourd.io import read_json
     from fourd.stereo.files import refused_pairs
 
-    folder = Path(config["pathvars"].get("results", "results")) / SCENE.name
+    folder = Path(RESULTS)
     films = [p for p in (folder / "render" / f"{name}.mp4" for name in TRAJECTORIES) if p.is_file()]
-    print(f"\nFilms of {SCENE.name}:", *(f"  {film}" for film in films), sep="\n")
+    if films:
+        print(f"\nFilms of {SCENE.name}:", *(f"  {film}" for film in films), sep="\n")
+    cameras = folder / "sfm" / "cameras.json"
+    left_out = read_json(cameras)["left_out"] if cameras.is_file() else {}
+    if left_out:
+        print(f"\n{len(left_out)} of {len(SCENE.cameras)} cameras were left out:")
+        print(*(f"  {cam}: {reason}" for cam, reason in left_out.items()), sep="\n")
     refused = refused_pairs([folder / "rectification" / f"{pair}.npz" for pair in SCENE.pairs])
+    # A camera that was left out has been named already.
+    refused = {p: r for p, r in refused.items() if not left_out.keys() & set(p.split("-"))}
     if refused:
         print(f"\n{len(refused)} of {len(SCENE.pairs)} pairs of cameras were left out:")
         print(*(f"  {pair}: {reason}" for pair, reason in refused.items()), sep="\n")

@@ -5,7 +5,7 @@ rule train_level:
     input:
         views=expand("<results>/{{scene}}/views/{cam}.json", cam=SCENE.inputs),
         cameras="<results>/{scene}/sfm/cameras.json",
-        ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
+        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         foreground=training_foregrounds(),
         background=training_backgrounds(),
     output:
@@ -28,6 +28,6 @@ rule train_level:
     shell:
         "python -m fourd.composition train --level {wildcards.level}"
         " --num-levels {params.num_levels} --views {input.views} --cameras {input.cameras}"
-        " --ingest {input.ingest} --foreground {input.foreground} --background {input.background}"
+        " --films {input.films} --foreground {input.foreground} --background {input.background}"
         " {params.options} --threads {threads} --output-model {output.model}"
         " --output-log {output.table} 2> >(tee {log} >&2)"

@@ -64,6 +64,24 @@ rule demo_labels:
         "python -m fourd.demo labels --name {wildcards.demo_cam} --output {output} {params.options} 2> {log}"
 
 
+rule demo_phone_labels:
+    output:
+        directory("data/demo/truth/phone_labels/{demo_cam}"),
+    log:
+        "<logs>/demo/demo_phone_labels/{demo_cam}.log",
+    benchmark:
+        "<benchmarks>/demo/demo_phone_labels/{demo_cam}.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        options=DEMO_FLAGS,
+        version=fourd_config.stage_version("demo"),
+    shell:
+        "python -m fourd.demo labels --of-phone --name {wildcards.demo_cam} --output {output}"
+        " {params.options} 2> {log}"
+
+
 rule demo_phone:
     output:
         "data/demo/phones/{demo_cam}.mp4",
@@ -104,7 +122,11 @@ rule demo_truth:
 # Everything that the demo can give, for measurements: the main job needs frames and cameras only.
 rule demo_all:
     input:
-        expand("data/demo/{kind}/{cam}", kind=["frames", "truth/labels"], cam=SCENE.cameras),
+        expand(
+            "data/demo/{kind}/{cam}",
+            kind=["frames", "truth/labels", "truth/phone_labels"],
+            cam=SCENE.cameras,
+        ),
         expand("data/demo/phones/{cam}.mp4", cam=SCENE.cameras),
         rules.demo_cameras.output,
         rules.demo_truth.output,

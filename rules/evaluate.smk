@@ -5,7 +5,7 @@ rule evaluate_camera:
     input:
         view="<results>/{scene}/views/{cam}.json",
         cameras="<results>/{scene}/sfm/cameras.json",
-        ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.cameras),
+        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.cameras),
         labels=labels_of,
         rendered=evaluated("render"),
         foreground=evaluated("foreground", ".npz"),
@@ -26,7 +26,7 @@ rule evaluate_camera:
         version=fourd_config.stage_version("evaluate"),
     shell:
         "python -m fourd.evaluate camera --view-file {input.view} --cameras {input.cameras}"
-        " --ingest {input.ingest} {params.labels} --rendered {input.rendered}"
+        " --films {input.films} {params.labels} --rendered {input.rendered}"
         " --foreground {input.foreground} --background {input.background} {params.options}"
         " --output {output.table} --output-sheet {output.sheet} 2> {log}"
 

@@ -7,7 +7,7 @@ rule fuse_training:
     input:
         view=expand("<results>/{{scene}}/views/{cam}.json", cam=SCENE.inputs),
         cameras="<results>/{scene}/sfm/cameras.json",
-        ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
+        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=expand("<results>/{{scene}}/disparity/{pair}/{{chunk}}.npz", pair=SCENE.pairs),
     output:
         [
@@ -28,7 +28,7 @@ rule fuse_training:
         version=fourd_config.stage_version("fuse"),
     shell:
         "python -m fourd.fuse foreground --view-file {input.view} --cameras {input.cameras}"
-        " --frames {params.frames} --disparity {input.disparity} --ingest {input.ingest}"
+        " --frames {params.frames} --disparity {input.disparity} --films {input.films}"
         " {params.options} --output {output} 2> {log}"
 
 
@@ -36,7 +36,7 @@ rule fuse_foreground:
     input:
         view="<results>/{scene}/views/{view}.json",
         cameras="<results>/{scene}/sfm/cameras.json",
-        ingest=expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.inputs),
+        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=disparities_of_view,
     output:
         intermediate("foreground", "<results>/{scene}/foreground/{view}/{chunk}.npz"),
@@ -57,5 +57,5 @@ rule fuse_foreground:
         version=fourd_config.stage_version("fuse"),
     shell:
         "python -m fourd.fuse foreground --view-file {input.view} --cameras {input.cameras}"
-        " --frames {params.frames} --disparity {input.disparity} --ingest {input.ingest}"
+        " --frames {params.frames} --disparity {input.disparity} --films {input.films}"
         " --estimates {params.estimates} {params.options} --output {output} 2> {log}"

@@ -22,7 +22,8 @@ rule probe_camera:
     input:
         source=lambda wildcards: SCENE.cameras[wildcards.cam].source,
     output:
-        "<results>/{scene}/ingest/{cam}.json",
+        facts="<results>/{scene}/ingest/{cam}.json",
+        table="<results>/{scene}/ingest/{cam}.csv",
     log:
         "<logs>/{scene}/probe_camera/{cam}.log",
     benchmark:
@@ -31,12 +32,10 @@ rule probe_camera:
         "../envs/vision.yaml"
     threads: 1
     params:
+        # Of folders of images, which have no times of their own.
         fps=SCENE.fps,
-        num_frames=SCENE.num_frames,
-        offset_s=lambda wildcards: SCENE.cameras[wildcards.cam].offset_s,
         options=options("ingest"),
         version=fourd_config.stage_version("ingest"),
     shell:
-        "python -m fourd.ingest --camera {wildcards.cam} --source {input.source:q}"
-        " --fps {params.fps} --num-frames {params.num_frames} --offset-s {params.offset_s}"
-        " {params.options} --output {output} 2> {log}"
+        "python -m fourd.ingest --camera {wildcards.cam} --source {input.source:q} --fps {params.fps}"
+        " {params.options} --output-json {output.facts} --output-table {output.table} 2> {log}"

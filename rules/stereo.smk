@@ -24,7 +24,7 @@ rule rectify_pair:
 
 rule disparity:
     input:
-        unpack(ingest_of_pair),
+        unpack(films_of_pair),
         cameras="<results>/{scene}/sfm/cameras.json",
         rectification="<results>/{scene}/rectification/{pair}.npz",
     output:
@@ -43,5 +43,5 @@ rule disparity:
         version=fourd_config.stage_version("stereo"),
     shell:
         "python -m fourd.stereo disparity --rectification {input.rectification}"
-        " --left-ingest {input.left} --right-ingest {input.right} --cameras {input.cameras}"
+        " --left-film {input.left} --right-film {input.right} --cameras {input.cameras}"
         " --frames {params.frames} {params.options} --threads {threads} --output {output} 2> {log}"

@@ -64,6 +64,7 @@ def tiny_scene(num_cameras: int = 5, num_frames: int = 6) -> dict:
         "size": [96, 54],
         "cameras": {name: {"source": f"data/demo/frames/{name}"} for name in names},
         "heldout": names[2:3],
+        "clock": "given",
         "calibration": ["data/demo/cameras.json"],
         "labels": "data/demo/truth/labels",
         "settings": {

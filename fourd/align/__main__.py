@@ -11,13 +11,14 @@ import numpy as np
 
 from fourd.align.clock import CameraClock, Offsets, read_offsets, write_offsets
 from fourd.align.evidence import draw_evidence
-from fourd.align.film_motion import find_motion, no_motion, read_motion, write_motion
 from fourd.align.listen import run_listen
+from fourd.align.motion_maps import map_motion, no_maps, read_motion_maps, write_motion_maps
+from fourd.align.moving_tracks import no_tracks, read_tracks, track_motion, write_tracks
 from fourd.align.options import AlignOptions
 from fourd.align.request import ClockRequest, check_request
 from fourd.align.sample import GivenClock, SampleOptions, clock_from_offsets, run_sample
 from fourd.align.sampling import choose_start
-from fourd.align.solve import needs_vision, solve_all
+from fourd.align.solve import Motion, needs_vision, solve_all
 from fourd.align.spatiotemporal_options import SpatiotemporalOptions
 from fourd.align.vision_options import VisionOptions
 from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
@@ -41,7 +42,9 @@ def _make_parser() -> argparse.ArgumentParser:
         command.add_argument("--output-evidence", type=Path, required=True, help="PNG of what it rests on")
     add_options(listen, AlignOptions)
     track.add_argument("--ingest", type=Path, required=True, help="ingest/{cam}.json")
-    solve.add_argument("--motion", type=Path, nargs="+", required=True, help="align/motion/{cam}.npz of all")
+    track.add_argument("--output-maps", type=Path, required=True, help="align/maps/{cam}.npz")
+    solve.add_argument("--tracks", type=Path, nargs="+", required=True, help="align/tracks/{cam}.npz of all")
+    solve.add_argument("--maps", type=Path, nargs="+", required=True, help="align/maps/{cam}.npz of all")
     for command in (track, solve):
         command.add_argument("--audio", type=Path, required=True, help="align/audio.json")
         command.add_argument("--cameras", type=Path, required=True, help="sfm/film_cameras.json")
@@ -92,17 +95,21 @@ def _track(args: argparse.Namespace) -> None:
         reason = needs_vision(audio, request, options)
         if reason:
             log.info("%s: sight is needed: %s", reader.camera, reason)
-            motion = find_motion(reader, film, options)
+            tracks, maps = track_motion(reader, film, options), map_motion(reader, film)
         else:
-            motion = no_motion(reader.camera, "not looked at: sound suffices")
-    log.info("%s: %d moving points, %s", motion.name, motion.num_tracks, motion.status)
-    write_motion(args.output, motion)
+            reason = "not looked at: sound suffices"
+            tracks, maps = no_tracks(reader.camera, reason), no_maps(reader.camera, reason)
+    log.info("%s: %d moving points, %s", tracks.name, tracks.num_tracks, tracks.status)
+    write_tracks(args.output, tracks)
+    write_motion_maps(args.output_maps, maps)
 
 
 def _solve(args: argparse.Namespace) -> None:
     request = _read_request(args)
     documents = {str(d["camera"]): d for d in map(read_json, args.ingest)}
-    motions = {motion.name: motion for motion in map(read_motion, args.motion)}
+    tracks = {film.name: film for film in map(read_tracks, args.tracks)}
+    maps = {film.name: film for film in map(read_motion_maps, args.maps)}
+    motions = {name: Motion(tracks[name], maps[name]) for name in tracks}
     solution = solve_all(
         request,
         read_offsets(args.audio),

@@ -19,7 +19,7 @@ from fourd.align.options import AlignOptions
 from fourd.align.sound import BAND_RATE_HZ, HIGH_HZ, LOW_HZ, NUM_BANDS, RATE_HZ, Sound
 
 # Exponent of the whitening: 1 is the phase transform, 0 plain correlation (benches/audio_sync.py).
-WHITENING = 0.8
+WHITENING = 0.9
 MIN_OVERLAP_S = 0.4
 NUM_CANDIDATES = 5
 # Two peaks nearer than this are one: the sound's own likeness to itself, its echo.
@@ -30,10 +30,15 @@ MIN_WAVE_SHARE = 0.5
 # Chance does not reach this height in a window.
 SURE_WEIGHT = 12.0
 # In a shorter film a pause cannot be told from two sounds that are alike.
-MIN_PAUSE_WINDOWS = 10
+MIN_PAUSE_WINDOWS, MIN_PART_WINDOWS = 10, 3
 SEARCH_S = 0.06
 BAND_TOLERANCE_S, WAVE_TOLERANCE_S = 0.02, 0.0015
 BAND_SIGMA_S, WAVE_SIGMA_S = 4e-3, 1e-4
+# A room moves the loudness of all windows alike, so that their agreement does not show it.
+BAND_BIAS_S = 2e-3
+# Odds that a lag is that of the direct sound go with the summed correlation to this power; chosen so that
+# 95 % of the errors in rooms stay within two sigma (benches/audio_sync.py, part `rooms`).
+LAG_POWER = 7
 # Log-odds that a delay is right: constant, log prominence of the search, and for waveforms log height
 # of the windows' sum and share of agreeing windows, for bands log height of the search. Fitted to
 # related and unrelated recordings (benches/audio_sync.py, table `score`).
@@ -96,6 +101,12 @@ def estimate_audio_delay(
     best = max(candidates, key=lambda match: match.delay.score)
     # The next best first: the true delay of the other part, not its echo in music that repeats.
     others = sorted(candidates, key=lambda match: -match.delay.score)[1:]
+    others += [
+        _follow_peak(left, part, *search_part, peak, names, options)
+        for part in _unmatched_parts(best, right)
+        for search_part in (_search_bands(left, part, options.max_delay_s),)
+        for peak in _highest_peaks(*search_part)
+    ]
     pauses = (_describe_pause(best, other, options.window_s) for other in others)
     pause = next(filter(None, pauses), None)
     if pause is None:
@@ -103,14 +114,36 @@ def estimate_audio_delay(
     return dataclasses.replace(best, delay=dataclasses.replace(best.delay, score=0.0, status=pause))
 
 
+def _unmatched_parts(match: SoundMatch, right: Sound) -> list[Sound]:
+    """What the right film heard before and after the windows that fit the left one, if that is long.
+
+    In music that repeats, the delay of such a part stands out only when it is searched by itself.
+    """
+    if match.windows is None or match.line is None or not match.is_wave:
+        return []
+    time_s = match.windows.time_s
+    sure = np.flatnonzero(match.line.is_used & (match.windows.weight >= SURE_WEIGHT))
+    if len(sure) < 3 or len(time_s) < MIN_PAUSE_WINDOWS:
+        return []
+    first, last = int(sure[0]), int(sure[-1])
+    parts = []
+    if first >= MIN_PART_WINDOWS:
+        parts.append(right.cut(right.start_s, float(time_s[first])))
+    if len(time_s) - 1 - last >= MIN_PART_WINDOWS:
+        parts.append(right.cut(float(time_s[last]), right.end_s))
+    return parts
+
+
 def _describe_pause(best: SoundMatch, other: SoundMatch, window_s: float) -> str | None:
     """Why two delays are both right, each for its own part of the films; None if they are not."""
+    if best.windows is None or len(best.windows.time_s) < MIN_PAUSE_WINDOWS:
+        return None
     spans = []
     for match in (best, other):
         if match.windows is None or match.line is None or not match.is_wave:
             return None
         sure = match.line.is_used & (match.windows.weight >= SURE_WEIGHT)
-        if sure.sum() < 3 or len(sure) < MIN_PAUSE_WINDOWS:
+        if sure.sum() < 3:
             return None
         spans.append((match.windows.time_s[sure], match.line))
     (first_s, first), (second_s, second) = sorted(spans, key=lambda span: float(span[0].mean()))
@@ -118,6 +151,8 @@ def _describe_pause(best: SoundMatch, other: SoundMatch, window_s: float) -> str
     if first_s.max() >= second_s.min() + window_s:
         return None
     jump_s = float(second.at(second_s.min()) - first.at(first_s.max()))
+    if abs(jump_s) <= PEAK_GAP_S:
+        return None
     break_s = (first_s.max() + second_s.min()) / 2
     return (
         f"the delay of their sound jumps by {jump_s:+.2f} s about {break_s:.1f} s after the start of "
@@ -145,20 +180,22 @@ def _follow_peak(
     wave_line = fit_line(waves.time_s, waves.delay_s, waves.weight**2, WAVE_TOLERANCE_S, WAVE_SIGMA_S)
     prominence = math.log(_prominence(search_s, search, peak))
     height = math.log(max(float(search[peak]), 0.1))
-    sum_height = math.log(max(float(stack_windows(waves, wave_line)[1].max()), 0.1))
+    lags_s, total = stack_windows(waves, wave_line)
+    sum_height = math.log(max(float(total.max()), 0.1))
     share = float(waves.weight[wave_line.is_used].sum() / waves.weight.sum())
     wave_score = _probability(WAVE_ODDS, (prominence, sum_height, share))
     band_score = _probability(BAND_ODDS, (prominence, height))
     # Waveforms are by far the finer measure, but in a hall they may lock to a reflection.
     is_wave = share >= MIN_WAVE_SHARE
     line, score = (wave_line, wave_score) if is_wave else (band_line, band_score)
+    bias_s = _spread_of_lags(lags_s, total) if is_wave else BAND_BIAS_S
     status = "ok"
     if score < options.min_sound_score:
         status = f"no delay stands out in their sound (score {score:.2f}, wanted {options.min_sound_score:g})"
     delay = PairDelay(
         *names,
         delay_s=float(line.at(0.0)),
-        sigma_s=line.sigma_s,
+        sigma_s=math.hypot(line.sigma_s, bias_s),
         score=score,
         method="audio",
         rate_ppm=line.rate_ppm,
@@ -293,6 +330,15 @@ def _refine_peaks(curves: np.ndarray, peaks: np.ndarray) -> np.ndarray:
     bend = before - 2 * middle + after
     vertex = 0.5 * (before - after) / np.where(bend < 0, bend, -np.inf)
     return np.where(inner == peaks, np.clip(vertex, -0.5, 0.5), 0.0)
+
+
+def _spread_of_lags(lags_s: np.ndarray, total: np.ndarray) -> float:
+    """Doubt about the direct sound, s: how far from the line other lags are that could be it, too.
+
+    Windows that all lock to the same reflection agree with each other; only the sum's other peaks tell.
+    """
+    chance = (np.maximum(total, 0) / max(float(total.max()), 1e-12)) ** LAG_POWER
+    return math.sqrt(float((chance * lags_s**2).sum()) / max(float(chance.sum()), 1e-12))
 
 
 def stack_windows(windows: Windows, line: Line) -> tuple[np.ndarray, np.ndarray]:

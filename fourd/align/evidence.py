@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from fourd.align.audio_delay import SoundMatch
 from fourd.align.clock import Offsets
+from fourd.align.epipolar_motion import EpipolarMatch
 from fourd.align.visual_delay import VisualMatch
 
 _DPI = 80
@@ -19,12 +20,15 @@ _USED, _UNUSED, _REFUSED = "#1f6fb4", "#b8b8b8", "#c43c2c"
 _MAX_ROWS = 60
 
 
-def draw_evidence(offsets: Offsets, matches: Sequence[SoundMatch | VisualMatch]) -> np.ndarray:
+def draw_evidence(
+    offsets: Offsets, matches: Sequence[SoundMatch | VisualMatch | EpipolarMatch]
+) -> np.ndarray:
     """(H, W, 3) uint8 RGB: a table of the clocks, then what each pair of films says.
 
     offsets: the clocks, by whatever method;  matches: of sound or of sight, may be empty
     For sound, its correlation and the delays of its windows; for sight, the votes of moving points and
-    how far they are off their epipolar planes. Of more than 60 pairs those with the lowest scores.
+    how far they are off their epipolar planes, or how motion on those planes agrees. Of more
+    than 60 pairs those with the lowest scores.
     """
     shown = list(matches)
     if len(shown) > _MAX_ROWS:
@@ -40,7 +44,10 @@ def draw_evidence(offsets: Offsets, matches: Sequence[SoundMatch | VisualMatch])
         _draw_table(figure.add_subplot(rows[0, :]), offsets)
         for index, match in enumerate(shown, start=1):
             axes = figure.add_subplot(rows[index, 0]), figure.add_subplot(rows[index, 1])
-            if isinstance(match, VisualMatch):
+            if isinstance(match, EpipolarMatch):
+                _draw_agreement(axes[0], match)
+                axes[1].axis("off")
+            elif isinstance(match, VisualMatch):
                 _draw_votes(axes[0], match)
                 _draw_valley(axes[1], match)
             else:
@@ -89,6 +96,21 @@ def _draw_votes(axes: Axes, match: VisualMatch) -> None:
     if delay.status == "ok":
         axes.plot(delay.delay_s, match.votes.max(), "v", color=color, markersize=6)
     axes.set_ylabel("votes")
+    axes.set_xlabel("delay, s")
+
+
+def _draw_agreement(axes: Axes, match: EpipolarMatch) -> None:
+    """Agreement of the motion on epipolar planes against delay."""
+    delay = match.delay
+    color = _USED if delay.status == "ok" else _REFUSED
+    axes.set_title(
+        f"{delay.left} - {delay.right}: {delay.delay_s:+.4f} s by motion on planes, score {delay.score:.2f}",
+        loc="left",
+        color=color,
+    )
+    axes.plot(match.offsets_s, match.evidence, color="#555555", linewidth=0.6)
+    axes.axvline(delay.delay_s, color=color, linewidth=0.8)
+    axes.set_ylabel("agreement")
     axes.set_xlabel("delay, s")
 
 

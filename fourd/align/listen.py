@@ -22,6 +22,8 @@ from fourd.io import read_json
 
 log = logging.getLogger(__name__)
 
+# How the status of a copy begins: it is a second witness of nothing, and sight must not take it for one.
+SAME_RECORDING = "same recording as"
 # Until cameras are known: standard deviation of how much later one camera hears an event than another,
 # from 1.7 m of difference in distance.
 TRAVEL_SIGMA_S = 5e-3
@@ -45,14 +47,14 @@ def read_sounds(ingest_paths: Sequence[Path]) -> tuple[dict[str, Sound], dict[st
         name = str(document["camera"])
         film_key = f"film {document['sha256']}"
         if film_key in first_with:
-            status[name] = f"same recording as {first_with[film_key]}"
+            status[name] = f"{SAME_RECORDING} {first_with[film_key]}"
             continue
         first_with[film_key] = name
         status[name], sound, sound_key = _read_sound(document)
         if sound is None:
             continue
         if sound_key in first_with:
-            status[name] = f"same recording as {first_with[sound_key]}: their sound is equal in every sample"
+            status[name] = f"{SAME_RECORDING} {first_with[sound_key]}: their sound is equal in every sample"
             continue
         first_with[sound_key] = name
         sounds[name] = sound

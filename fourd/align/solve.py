@@ -14,8 +14,10 @@ import numpy as np
 
 from fourd.align.clock import PPM, CameraClock, Offsets, PairDelay
 from fourd.align.clock_graph import attach_clock, correct_sound_travel, solve_clocks
-from fourd.align.film_motion import FilmMotion
-from fourd.align.listen import TRAVEL_SIGMA_S
+from fourd.align.epipolar_motion import EpipolarMatch, compare_motion
+from fourd.align.listen import SAME_RECORDING, TRAVEL_SIGMA_S
+from fourd.align.motion_maps import MotionMaps
+from fourd.align.moving_tracks import MovingTracks
 from fourd.align.request import ClockRequest
 from fourd.align.spatiotemporal import refine_clocks
 from fourd.align.spatiotemporal_options import SpatiotemporalOptions
@@ -66,27 +68,43 @@ def sound_pairs(audio: Offsets, films: FilmCameras) -> list[PairDelay]:
     )
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Motion:
+    """What moves in one film, as points that are followed and as maps."""
+
+    tracks: MovingTracks
+    maps: MotionMaps
+
+
 def compare_films(
     pairs: Sequence[tuple[str, str]],
-    motions: Mapping[str, FilmMotion],
+    motions: Mapping[str, Motion],
     films: Mapping[str, FilmCamera],
     audio: Offsets,
     options: VisionOptions,
-) -> list[VisualMatch]:
-    """What sight says about pairs of films: near what sound says, or everywhere where it is silent."""
+) -> list[VisualMatch | EpipolarMatch]:
+    """What sight says about pairs of films: near what sound says, or everywhere where it is silent.
+
+    Where no points match, because the views are too far apart, the motion on epipolar planes may tell.
+    """
     rays: dict[str, TrackRays] = {
-        name: rays_of_tracks(motions[name], films[name]) for name in {name for pair in pairs for name in pair}
+        name: rays_of_tracks(motions[name].tracks, films[name])
+        for name in sorted({name for pair in pairs for name in pair})
     }
-    matches = []
+    matches: list[VisualMatch | EpipolarMatch] = []
     for left, right in pairs:
         one, other = audio.clocks[left], audio.clocks[right]
         search = (-options.max_delay_s, options.max_delay_s)
         if one.status == other.status == "ok":
             heard = other.offset_s - one.offset_s
             search = (heard - NEAR_SOUND_S, heard + NEAR_SOUND_S)
-        match = estimate_visual_delay(
-            motions[left], motions[right], (rays[left], rays[right]), search, options
+        tracks = motions[left].tracks, motions[right].tracks
+        match: VisualMatch | EpipolarMatch = estimate_visual_delay(
+            *tracks, (rays[left], rays[right]), search, options
         )
+        if match.delay.status != "ok":
+            wide = compare_motion(motions[left].maps, motions[right].maps, search, options.min_visual_score)
+            match = wide if wide.delay.status == "ok" else match
         delay = match.delay
         log.info("%s %s: %.4f s, score %.2f: %s", left, right, delay.delay_s, delay.score, delay.status)
         matches.append(match)
@@ -134,8 +152,8 @@ def merge_pairs(
 def refine_jointly(
     clocks: Mapping[str, CameraClock],
     reference: str,
-    matches: Sequence[VisualMatch],
-    motions: Mapping[str, FilmMotion],
+    matches: Sequence[VisualMatch | EpipolarMatch],
+    motions: Mapping[str, Motion],
     films: Mapping[str, FilmCamera],
     options: SpatiotemporalOptions,
 ) -> tuple[dict[str, CameraClock], tuple[str, ...]]:
@@ -144,7 +162,8 @@ def refine_jointly(
     A camera that the joint solution refuses, or moves further than its doubt allows, keeps its clock.
     """
     names = [name for name, clock in clocks.items() if clock.status == "ok"]
-    points = join_observations(names, motions, matches)
+    tracks = {name: motions[name].tracks for name in names}
+    points = join_observations(names, tracks, [m for m in matches if isinstance(m, VisualMatch)])
     num_points = int(points.point.max()) + 1 if len(points.point) else 0
     if num_points < MIN_JOINT_POINTS or len(names) < 2:
         return dict(clocks), (
@@ -185,14 +204,14 @@ class Solution:
     """offsets: final, without `start_s`;  matches: what sight says about each pair, for the plot"""
 
     offsets: Offsets
-    matches: tuple[VisualMatch, ...] = ()
+    matches: tuple[VisualMatch | EpipolarMatch, ...] = ()
 
 
 def solve_all(
     request: ClockRequest,
     audio: Offsets,
     films: FilmCameras,
-    motions: Mapping[str, FilmMotion],
+    motions: Mapping[str, Motion],
     vision: VisionOptions,
     spatiotemporal: SpatiotemporalOptions,
 ) -> Solution:
@@ -201,25 +220,30 @@ def solve_all(
     motions: by camera; not used where sound suffices
     """
     heard = sound_pairs(audio, films)
+    copies = {n for n, clock in audio.clocks.items() if clock.status.startswith(SAME_RECORDING)}
+    inputs = [name for name in request.inputs if name not in copies]
     reason = needs_vision(audio, request, vision)
     notes = [*audio.notes, f"sight is used: {reason}" if reason else "sight is not used: sound suffices"]
-    seen: list[VisualMatch] = []
+    seen: list[VisualMatch | EpipolarMatch] = []
     if reason:
-        pairs = list(itertools.combinations(request.inputs, 2))
+        pairs = list(itertools.combinations(inputs, 2))
         seen = compare_films(pairs, motions, films.cameras, audio, vision)
     merged, more = merge_pairs(heard, [match.delay for match in seen])
     notes += more
-    clocks, more = solve_clocks(request.inputs, merged, audio.reference)
+    clocks, more = solve_clocks(inputs, merged, audio.reference)
     notes += more
     reference = next((n for n, c in clocks.items() if c.method == "reference"), audio.reference)
     if seen:
         clocks, more = refine_jointly(clocks, reference, seen, motions, films.cameras, spatiotemporal)
         notes += more
     fixed = dict(clocks)
+    clocks |= {name: audio.clocks[name] for name in copies}
     for name in request.heldout:
-        against: list[VisualMatch] = []
+        if name in copies:
+            continue
+        against: list[VisualMatch | EpipolarMatch] = []
         if reason:
-            pairs = [(other, name) for other in request.inputs if fixed[other].status == "ok"]
+            pairs = [(other, name) for other in inputs if fixed[other].status == "ok"]
             against = compare_films(pairs, motions, films.cameras, audio, vision)
         mine = [p for p in heard if name in (p.left, p.right)]
         merged_mine, more = merge_pairs(mine, [match.delay for match in against])

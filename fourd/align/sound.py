@@ -38,6 +38,14 @@ class Sound:
         """Time of the end on the camera's own clock."""
         return self.start_s + self.samples.shape[1] / RATE_HZ
 
+    def cut(self, begin_s: float, end_s: float) -> "Sound":
+        """The piece between two times on the camera's own clock, begun at a whole hop of the bands."""
+        first = max(math.floor((begin_s - self.start_s) * BAND_RATE_HZ), 0)
+        last = math.floor((end_s - self.start_s) * BAND_RATE_HZ)
+        samples = self.samples[:, first * HOP : last * HOP]
+        num_frames = max((samples.shape[1] - FRAME) // HOP + 1, 0)
+        return Sound(samples, self.bands[:, first : first + num_frames], self.start_s + first / BAND_RATE_HZ)
+
 
 def check_sound(samples: np.ndarray, sample_rate: float) -> str:
     """`ok`, or the reason why a film's sound cannot be compared.

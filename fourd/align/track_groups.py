@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fourd.align.film_motion import FilmMotion
 from fourd.align.moving_points import MovingPoints
+from fourd.align.moving_tracks import MovingTracks
 from fourd.align.visual_delay import VisualMatch
 
 # KLT positions on moving, turning surfaces.
@@ -35,7 +35,7 @@ def group_tracks(matches: Sequence[VisualMatch]) -> list[list[tuple[str, int]]]:
 
 
 def join_observations(
-    names: Sequence[str], motions: Mapping[str, FilmMotion], matches: Sequence[VisualMatch]
+    names: Sequence[str], motions: Mapping[str, MovingTracks], matches: Sequence[VisualMatch]
 ) -> MovingPoints:
     """The moving points that two or more films saw; cameras in the order of `names`."""
     used = [m for m in matches if {m.delay.left, m.delay.right} <= set(names) and m.delay.status == "ok"]

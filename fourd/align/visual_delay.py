@@ -4,7 +4,7 @@ Tracks of moving points are matched by their looks alone, at whatever times they
 pair of tracks that is one and the same point lies on common epipolar planes at the right offset, and
 at few others: its angle off the plane, as a function of the offset, has a valley there. Every pair of
 tracks votes with its valley; wrong matches vote for anything. Around the highest vote the offset is
-the one with the smallest sum of squared angles over the pairs that agree.
+the one at which the angles of the pairs that agree vary least.
 
 After the frame-level search of M. Vo, S. Narasimhan, Y. Sheikh, "Spatiotemporal Bundle Adjustment for
 Dynamic 3D Reconstruction", CVPR 2016, section 4, with votes over unverified matches in place of
@@ -17,7 +17,7 @@ import numba
 import numpy as np
 
 from fourd.align.clock import PairDelay
-from fourd.align.film_motion import FilmMotion
+from fourd.align.moving_tracks import MovingTracks
 from fourd.align.vision_options import VisionOptions
 from fourd.film_cameras import FilmCamera
 
@@ -25,6 +25,7 @@ COARSE_STEP_S = 1 / 60
 # The refined search: this far around the highest vote, in these steps.
 FINE_RANGE_S, FINE_STEP_S = 0.05, 5e-4
 MIN_COMMON = 6
+CONSTANT_SHARE = 0.95
 MATCH_RATIO = 0.85
 # Votes this far from the highest one belong to other offsets.
 PEAK_GAP_S = 0.1
@@ -40,7 +41,7 @@ class VisualMatch:
     """A pair's delay and what speaks for it.
 
     offsets_s, votes: (L,) the search;  tracks: (P, 2) matched tracks that agree with the delay
-    fine_s, cost: (K,) the refined search, mean squared angle in rad^2
+    fine_s, cost: (K,) the refined search, variance of the angle in rad^2
     """
 
     delay: PairDelay
@@ -51,7 +52,7 @@ class VisualMatch:
     cost: np.ndarray
 
 
-def match_tracks(left: FilmMotion, right: FilmMotion) -> np.ndarray:
+def match_tracks(left: MovingTracks, right: MovingTracks) -> np.ndarray:
     """(M, 2) int64 tracks of both films that look alike, each pair once, sorted.
 
     A descriptor must be clearly nearer to its match than to any descriptor of another track.
@@ -86,7 +87,7 @@ class TrackRays:
     first: np.ndarray
 
 
-def rays_of_tracks(motion: FilmMotion, film: FilmCamera) -> TrackRays:
+def rays_of_tracks(motion: MovingTracks, film: FilmCamera) -> TrackRays:
     """All observations of a film's tracks as rays in the world."""
     direction, center = np.zeros((len(motion.frame), 3)), np.zeros((len(motion.frame), 3))
     for frame in np.unique(motion.frame):
@@ -102,7 +103,7 @@ def rays_of_tracks(motion: FilmMotion, film: FilmCamera) -> TrackRays:
 
 @numba.njit(cache=True)
 def _off_plane(direction, center, other_direction, other_center):  # pragma: no cover
-    """Angle of a ray off the plane through the other ray and both centres, rad."""
+    """Signed angle of a ray off the plane through the other ray and both centres, rad."""
     bx, by, bz = (
         other_center[0] - center[0],
         other_center[1] - center[1],
@@ -114,7 +115,7 @@ def _off_plane(direction, center, other_direction, other_center):  # pragma: no 
     length = np.sqrt(nx * nx + ny * ny + nz * nz)
     if length == 0.0:
         return np.inf
-    return abs(direction[0] * nx + direction[1] * ny + direction[2] * nz) / length
+    return (direction[0] * nx + direction[1] * ny + direction[2] * nz) / length
 
 
 @numba.njit(cache=True)
@@ -139,7 +140,7 @@ def _track_angles(ld, lc, lt, rd, rc, rt, offset_s, out):  # pragma: no cover
 
 @numba.njit(cache=True)
 def _pair_angles(pairs, offsets, ld, lc, lt, lf, rd, rc, rt, rf, squared):  # pragma: no cover
-    """(P, L) median angle, or mean squared angle, of each pair at each offset; NaN without overlap."""
+    """(P, L) median angle, or variance of the angle, of each pair at each offset; NaN without overlap."""
     result = np.full((len(pairs), len(offsets)), np.nan)
     buffer = np.empty(len(lt))
     for p in range(len(pairs)):
@@ -151,7 +152,10 @@ def _pair_angles(pairs, offsets, ld, lc, lt, lf, rd, rc, rt, rf, squared):  # pr
             )
             if count >= MIN_COMMON:
                 values = buffer[:count]
-                result[p, q] = np.mean(values * values) if squared else np.median(values)
+                if squared:
+                    result[p, q] = np.mean(values * values) - CONSTANT_SHARE * np.mean(values) ** 2
+                else:
+                    result[p, q] = np.median(np.abs(values))
     return result
 
 
@@ -160,8 +164,9 @@ def measure_angles(
 ) -> np.ndarray:
     """(P, L) angle off the epipolar plane, rad, of each pair of tracks at each offset.
 
-    The median over the common times, or with `squared` the mean square; NaN where a pair has fewer than
-    MIN_COMMON common times. The right track is interpolated between its frames.
+    The median over the common times, or with `squared` the variance and a little of the squared mean: an
+    error of the cameras shifts all angles of a track alike, and must not pull the offset. NaN where a
+    pair has fewer than MIN_COMMON common times. The right track is interpolated between its frames.
     """
     return _pair_angles(
         pairs, offsets_s, left.direction, left.center, left.own_s, left.first,
@@ -170,8 +175,8 @@ def measure_angles(
 
 
 def estimate_visual_delay(
-    left: FilmMotion,
-    right: FilmMotion,
+    left: MovingTracks,
+    right: MovingTracks,
     rays: tuple[TrackRays, TrackRays],
     search_s: tuple[float, float],
     options: VisionOptions,
@@ -242,8 +247,8 @@ def _refine(fine: np.ndarray, costs: np.ndarray) -> tuple[float, float]:
 
 
 def _refused(
-    left: FilmMotion,
-    right: FilmMotion,
+    left: MovingTracks,
+    right: MovingTracks,
     reason: str,
     offsets: np.ndarray,
     votes: np.ndarray,

@@ -20,7 +20,7 @@ from fourd.errors import InputError
 from fourd.image import undistort
 from fourd.ingest import open_camera
 from fourd.sfm import read_cameras
-from fourd.views import View, read_view
+from fourd.views import LEFT_OUT, View, read_view
 
 log = logging.getLogger("fourd.composition")
 
@@ -30,25 +30,30 @@ NOT_IN_FINGERPRINT = ("epochs", "max_minutes", "checkpoint_s", "cache_mb")
 
 @dataclasses.dataclass(frozen=True)
 class Sources:
-    """Files of one training: see docs/formats.md. `ingest` maps a camera's name to its file."""
+    """Files of one training: see docs/formats.md. `films` maps a camera's name to its file."""
 
     views: tuple[Path, ...]
     foreground: tuple[Path, ...]
     background: tuple[Path, ...]
-    ingest: Mapping[str, Path]
+    films: Mapping[str, Path]
     cameras: Path
 
     def files(self) -> list[Path]:
         """All of them, in an order that does not depend on the command line's."""
-        paths = {*self.views, *self.foreground, *self.background, *self.ingest.values(), self.cameras}
+        paths = {*self.views, *self.foreground, *self.background, *self.films.values(), self.cameras}
         return sorted(paths)
 
 
 def read_training_views(paths: Sequence[Path]) -> dict[str, View]:
-    """Views of physical cameras by name. Raises InputError for a held-out or virtual one."""
+    """Views of input cameras by name; one that was left out has no frames to train on.
+
+    Raises InputError for a held-out or virtual one.
+    """
     views = {}
     for path in paths:
         view = read_view(path)
+        if view.role == LEFT_OUT:
+            continue
         if view.role != "input":
             raise InputError(
                 f"expected the view of an input camera in {path}, got role {view.role!r}: held-out and "
@@ -62,12 +67,12 @@ def target_reader(sources: Sources) -> data.ReadTarget:
     """A function (cam, frame) -> the camera's own frame as its ideal pinhole sees it, and validity."""
     tracks = read_cameras(sources.cameras).tracks
     views = read_training_views(sources.views)
-    for known, where in ((set(tracks), sources.cameras), (set(sources.ingest), "--ingest")):
+    for known, where in ((set(tracks), sources.cameras), (set(sources.films), "--films")):
         if missing := sorted(set(views) - known):
             raise InputError(
                 f"expected camera {missing[0]} of --views in {where}, got {sorted(known)}: add it"
             )
-    videos = {name: open_camera(sources.ingest[name]) for name in views}
+    videos = {name: open_camera(sources.films[name]) for name in views}
 
     def read_target(cam: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
         if cam not in views:
@@ -152,7 +157,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     command.add_argument("--foreground", type=Path, nargs="+", required=True, help="archives of these views")
     command.add_argument("--background", type=Path, nargs="+", required=True, help="archives of these views")
-    command.add_argument("--ingest", type=cli.named_path, nargs="+", required=True, metavar="CAM=FILE")
+    command.add_argument("--films", type=cli.named_path, nargs="+", required=True, metavar="CAM=FILE")
     command.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
     command.add_argument("--output-model", type=Path, required=True)
     command.add_argument("--output-log", type=Path, required=True)
@@ -171,7 +176,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=device == "cuda")
     sources = Sources(
-        tuple(args.views), tuple(args.foreground), tuple(args.background), dict(args.ingest), args.cameras
+        tuple(args.views), tuple(args.foreground), tuple(args.background), dict(args.films), args.cameras
     )
     options = cli.options_from_args(CompositionOptions, args)
     run(sources, args.level, args.num_levels, args.output_model, args.output_log, options, device)

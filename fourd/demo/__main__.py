@@ -33,6 +33,8 @@ def _make_parser() -> argparse.ArgumentParser:
             sub.add_argument("--name", required=True, help="cam00, cam01, ...")
         if command != "cameras":
             sub.add_argument("--without", nargs="*", default=[], help="figure1, figure2, ball")
+        if command == "labels":
+            sub.add_argument("--of-phone", action="store_true", help="of the phone's film, on its own clock")
         if command == "truth":
             sub.add_argument("--only", nargs="*", default=list(PARTS), help=f"(default: {' '.join(PARTS)})")
             sub.add_argument("--frames", type=int, nargs="*", help="frames with depth, labels (default: all)")
@@ -57,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.command == "camera":
         write_camera_frames(args.output, args.name, options, without)
     elif args.command == "labels":
-        write_camera_labels(args.output, args.name, options, without)
+        write_camera_labels(args.output, args.name, options, without, args.of_phone)
     else:
         write_phone_file(args.output, args.name, options, without)
 

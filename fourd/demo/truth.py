@@ -35,11 +35,15 @@ def write_camera_frames(
 
 
 def write_camera_labels(
-    output: Path | str, name: str, options: DemoOptions, without: Sequence[int] = ()
+    output: Path | str, name: str, options: DemoOptions, without: Sequence[int] = (), of_phone: bool = False
 ) -> None:
-    """Write what moves in the synchronised frames of one camera to OUTPUT/000000.png ... (0 static)."""
+    """Write what moves in the frames of one camera to OUTPUT/000000.png ... (0 static).
+
+    of_phone: the frames are those of the phone's film instead of the synchronised ones
+    """
+    times = make_phone(name, options).frame_times if of_phone else clip_times(options)
     with atomic_folder(output) as folder:
-        for frame, time_s in enumerate(clip_times(options)):
+        for frame, time_s in enumerate(times):
             scene = FrozenScene(float(time_s), options, without)
             write_png(folder / f"{frame:06d}.png", scene.trace(camera_at(name, float(time_s), options))[1])
 

@@ -18,7 +18,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     camera = commands.add_parser("camera", help="score one held-out camera")
     camera.add_argument("--view-file", type=Path, required=True)
     camera.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
-    camera.add_argument("--ingest", type=cli.named_path, nargs="+", required=True, metavar="CAM=FILE")
+    camera.add_argument("--films", type=cli.named_path, nargs="+", required=True, metavar="CAM=FILE")
     camera.add_argument("--rendered", type=Path, nargs="+", required=True, help="folders of the stage render")
     camera.add_argument("--foreground", type=Path, nargs="+", required=True)
     camera.add_argument("--background", type=Path, nargs="+", required=True)
@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     sources = Sources(
         args.view_file,
         args.cameras,
-        dict(args.ingest),
+        dict(args.films),
         tuple(args.rendered),
         tuple(args.foreground),
         tuple(args.background),

@@ -16,14 +16,14 @@ from fourd.errors import InputError
 from fourd.evaluate import EvaluateOptions
 from fourd.evaluate.contact_sheet import SheetRow, amplified_error, draw_sheet
 from fourd.evaluate.regions import StillPicture, find_dynamic_pixels, read_dynamic_mask
-from fourd.image import undistort
+from fourd.image import label_image, undistort
 from fourd.ingest import open_camera
 from fourd.io import Archive, read_image, write_csv, write_png
 from fourd.render import BackgroundReader, list_frames, read_arrays, with_progress
 from fourd.sfm import SceneCameras, read_cameras
-from fourd.views import View, ViewFrame, physical_view, read_view
+from fourd.views import LEFT_OUT, View, ViewFrame, physical_view, read_view
 
-COLUMNS = ("view", "frame", "method", "region", "region_source", "metric", "value", "num_pixels")
+COLUMNS = ("view", "frame", "dt_s", "method", "region", "region_source", "metric", "value", "num_pixels")
 FOREGROUND_KEYS = ("consensus_rgb", "consensus_valid")
 BACKGROUND_KEYS = ("farthest_rgb", "farthest_valid")
 STILL_FRAMES = 15
@@ -33,11 +33,11 @@ logger = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class Sources:
-    """Files of one held-out camera (docs/formats.md); `ingest` maps camera names to their files."""
+    """Files of one held-out camera (docs/formats.md); `films` maps camera names to their files."""
 
     view: Path
     cameras: Path
-    ingest: Mapping[str, Path]
+    films: Mapping[str, Path]
     rendered: tuple[Path, ...]
     foreground: tuple[Path, ...]
     background: tuple[Path, ...]
@@ -53,7 +53,7 @@ class EvidenceReader:
         _check_heldout(self.view, self._scene, sources)
         self._labels = sources.labels
         self._readers = {
-            name: open_camera(sources.ingest[name]) for name in (self.view.name, *self._scene.inputs)
+            name: open_camera(sources.films[name]) for name in (self.view.name, *self._scene.inputs)
         }
         self._rendered = list_frames(sources.rendered)
         self._archives = [Archive(path) for path in (*sources.foreground, *sources.background)]
@@ -100,7 +100,8 @@ class EvidenceReader:
         """(H, W) bool, where something moves: from the true masks if there are any."""
         if self._labels is not None:
             camera = self._scene.tracks[self.view.name].at(entry.scene_frame)
-            return read_dynamic_mask(self._labels, entry.scene_frame, camera, entry.camera)
+            shown = self._readers[self.view.name].source_frame(entry.scene_frame)
+            return read_dynamic_mask(self._labels, shown, camera, entry.camera)
         background = evidence.background
         pictures = [(background["farthest_rgb"], background["farthest_valid"])]
         if self._still is not None:
@@ -112,6 +113,10 @@ class EvidenceReader:
         """Where the dynamic region comes from: `truth` or `pipeline`."""
         return "pipeline" if self._labels is None else "truth"
 
+    def dt_s(self, entry: ViewFrame) -> float:
+        """When the true picture was taken after the moment that is rendered, seconds."""
+        return self._readers[self.view.name].dt_s(entry.scene_frame)
+
     def _make_still_picture(self) -> StillPicture | None:
         """None where there are true masks, or too few frames for a median to leave out what moves."""
         frames = spread_frames(self._scene.num_frames, STILL_FRAMES)
@@ -121,7 +126,8 @@ class EvidenceReader:
         return StillPicture([(self._readers[name].read(f), self._scene.tracks[name].at(f)) for f in frames])
 
     def _see(self, name: str, entry: ViewFrame) -> tuple[np.ndarray, np.ndarray]:
-        image = self._readers[name].read(entry.scene_frame)
+        # The truth is what was filmed: nothing in it is moved to the common time.
+        image = self._readers[name].read(entry.scene_frame, is_compensated=name != self.view.name)
         return undistort(image, self._scene.tracks[name].at(entry.scene_frame), entry.camera)
 
     def _see_input(self, name: str, scene_frame: int) -> np.ndarray:
@@ -134,9 +140,9 @@ def _check_heldout(view: View, scene: SceneCameras, sources: Sources) -> None:
             f"{sources.view}: expected the view of a held-out camera ({', '.join(scene.heldout) or 'none'}), "
             f"got {view.name} with role {view.role}: a camera that the result is made from proves nothing"
         )
-    missing = [name for name in (view.name, *scene.inputs) if name not in sources.ingest]
+    missing = [name for name in (view.name, *scene.inputs) if name not in sources.films]
     if missing:
-        raise InputError(f"expected camera {missing[0]} in --ingest, got {', '.join(sources.ingest)}: add it")
+        raise InputError(f"expected camera {missing[0]} in --films, got {', '.join(sources.films)}: add it")
 
 
 def score_image(
@@ -166,7 +172,15 @@ def format_value(value: float) -> str:
 
 
 def run_camera(sources: Sources, output: Path, output_sheet: Path, options: EvaluateOptions) -> None:
-    """Write the rows of one held-out camera and its contact sheet. Raises InputError."""
+    """Write the rows of one held-out camera and its contact sheet.
+
+    A camera that was left out has no rows, and its sheet says why. Raises InputError.
+    """
+    view = read_view(sources.view)
+    if view.role == LEFT_OUT:
+        write_csv(output, COLUMNS, [])
+        write_png(output_sheet, label_image(f"{view.name} is left out: {view.status}", (1200, 24)))
+        return
     reader = EvidenceReader(sources)
     try:
         entries = reader.view.frames
@@ -187,6 +201,7 @@ def run_camera(sources: Sources, output: Path, output_sheet: Path, options: Eval
                 {
                     "view": reader.view.name,
                     "frame": entry.frame,
+                    "dt_s": f"{reader.dt_s(entry):.6f}",
                     "region_source": reader.region_source,
                     **score,
                 }

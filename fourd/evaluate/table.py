@@ -20,12 +20,16 @@ Row = Mapping[str, str]
 
 
 def read_metrics(path: Path) -> list[dict[str, str]]:
-    """Rows of one camera's CSV. Raises InputError if it has other columns or no row."""
+    """Rows of one camera's CSV, none of a camera that was left out.
+
+    Raises InputError if there is no file or it has other columns.
+    """
     if not path.is_file():
         raise InputError(f"expected the scores of a camera at {path}, found nothing: evaluate it first")
     rows = read_csv(path)
-    if not rows or set(rows[0]) != set(COLUMNS):
-        given = ", ".join(rows[0]) if rows else "none"
+    header = path.read_text(encoding="utf-8").partition("\n")[0].strip().split(",")
+    if header != list(COLUMNS):
+        given = ", ".join(header)
         raise InputError(
             f"expected rows with {', '.join(COLUMNS)} in {path}, got {given}: "
             "delete it and evaluate the camera again"
@@ -105,7 +109,7 @@ def run_collect(
 ) -> str:
     """Write the joined rows, the table and the joined contact sheet; return the table. Raises InputError."""
     rows = [row for path in inputs for row in read_metrics(path)]
-    table = draw_table(rows)
+    table = draw_table(rows) if rows else "No held-out camera could be placed, so nothing is scored.\n"
     write_csv(output, COLUMNS, rows)
     write_text(output_table, table)
     write_png(output_sheet, stack_sheets([read_image(path) for path in sheets]))

@@ -1,6 +1,6 @@
 """Stage `fuse`: the instantaneous foreground of a view, frame by frame (section 3.1 of the paper).
 
-In: views/{view}.json, sfm/cameras.json, disparity/{pair}/{chunk}.npz of all pairs, ingest/{cam}.json.
+In: views/{view}.json, sfm/cameras.json, disparity/{pair}/{chunk}.npz of all pairs, frames/cameras/{cam}.npz.
 Out: foreground/{view}/{chunk}.npz (docs/formats.md).
 """
 
@@ -30,7 +30,7 @@ def run(
     cameras_path: Path,
     frames: Sequence[int],
     disparity_paths: Sequence[Path],
-    ingest: Sequence[str],
+    films: Sequence[str],
     estimates: Sequence[str],
     options: FuseOptions,
     device: str,
@@ -42,9 +42,10 @@ def run(
     Raises InputError for inputs that do not fit together.
     """
     view = read_view(view_path)
+    frames = view.frames_of(frames)
     scene = read_cameras(cameras_path)
     disparities = DisparityFiles(disparity_paths, view.name)
-    pictures = Pictures(ingest, scene, view.name)
+    pictures = Pictures(films, scene, view.name)
     meta: dict[str, Any] = {
         "view": view.name,
         "cameras": list(pictures.names),
@@ -96,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     command.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
     command.add_argument("--frames", type=int, nargs="+", required=True, help="output frames of the views")
     command.add_argument("--disparity", type=Path, nargs="*", default=[], help="files of all pairs")
-    command.add_argument("--ingest", nargs="*", default=[], help="ingest/{cam}.json, or CAMERA=PATH")
+    command.add_argument("--films", nargs="*", default=[], help="frames/cameras/{cam}.npz, or CAMERA=PATH")
     command.add_argument("--estimates", nargs="+", choices=ESTIMATES, default=list(ESTIMATES))
     command.add_argument("--device", default="auto", help="auto, cpu or a torch device")
     command.add_argument("--output", type=Path, nargs="+", required=True, help="one file per view file")
@@ -116,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             args.cameras,
             args.frames,
             args.disparity,
-            args.ingest,
+            args.films,
             estimates,
             options_from_args(FuseOptions, args),
             choose_device(args.device),

@@ -132,19 +132,19 @@ class PairFrames(Sequence[PairFrame]):
 class Pictures:
     """Original pictures and cameras of the input cameras by scene frame."""
 
-    def __init__(self, ingest: Sequence[str], scene: SceneCameras, exclude: str) -> None:
-        """ingest: paths of ingest/{cam}.json, or CAMERA=PATH;  exclude: the target camera's name.
+    def __init__(self, films: Sequence[str], scene: SceneCameras, exclude: str) -> None:
+        """films: paths of frames/cameras/{cam}.npz, or CAMERA=PATH;  exclude: the target camera's name.
 
         Raises InputError for a camera that is not calibrated.
         """
         self._scene = scene
         self._readers: dict[str, FrameReader] = {}
-        for entry in ingest:
+        for entry in films:
             # A path may hold an equals sign too.
             name, _, path = ("", "", entry) if Path(entry).exists() else entry.partition("=")
             reader = open_camera(path)
             name = name or reader.camera
-            if name != exclude:
+            if name != exclude and name not in scene.left_out:
                 self._readers[name] = reader
         unknown = [name for name in self._readers if name not in scene.tracks]
         if unknown:

@@ -1,7 +1,8 @@
-"""Stage `sfm`: cameras of the scene from calibration files, sparse points, near and far.
+"""Stage `sfm`: `recover` cameras from films, put known ones on `films`, `import` them to the scene.
 
-Inputs: calibration files in any known format, ingest/{cam}.json. Outputs: sfm/cameras.json and
-sfm/points.npz (docs/formats.md).
+`recover` and `films` read ingest/{cam}.json and write sfm/film_cameras.json, over the films' own
+frames. `import` reads calibration files in any known format (film_cameras.json is one) and
+align/cameras/{cam}.json, and writes sfm/cameras.json and sfm/points.npz (docs/formats.md).
 """
 
 import argparse
@@ -16,13 +17,23 @@ import numpy as np
 from fourd.camera import Camera, CameraTrack
 from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
 from fourd.errors import InputError
+from fourd.film_cameras import write_film_cameras
 from fourd.ingest import open_camera
 from fourd.io import ArchiveWriter
 from fourd.sfm import SceneCameras, SfmOptions, write_cameras
-from fourd.sfm.assemble import IngestedCamera, read_ingested, select_cameras, split_cameras
+from fourd.sfm.assemble import (
+    IngestedCamera,
+    check_inputs_left,
+    film_cameras_of,
+    find_left_out,
+    read_ingested,
+    select_cameras,
+    split_cameras,
+)
 from fourd.sfm.depth_range import DepthRange, choose_depth_ranges
 from fourd.sfm.importers import FORMATS, ImportedCameras, read_calibration
 from fourd.sfm.normalize import estimate_similarity, estimate_up, sample_cameras
+from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.sparse import find_sparse_points, sparse_frames
 
 log = logging.getLogger("fourd.sfm")
@@ -51,7 +62,7 @@ def run_import(
     calibration_format: str,
     names_in_file: Mapping[str, str],
     heldout: Sequence[str],
-    ingest_paths: Mapping[str, Path],
+    film_paths: Mapping[str, Path],
     num_frames: int,
     fps: float,
     depth_range: tuple[float, float] | None,
@@ -63,13 +74,17 @@ def run_import(
     depth_range: (near, far) in the calibration's units, or None to estimate
     Raises InputError for every input that does not fit.
     """
-    inputs = split_cameras(list(names_in_file), heldout)
-    missing = [name for name in names_in_file if name not in ingest_paths]
+    split_cameras(list(names_in_file), heldout)
+    missing = [name for name in names_in_file if name not in film_paths]
     if missing:
-        raise InputError(f"expected an ingest file for every camera, got none for {', '.join(missing)}")
+        raise InputError(f"expected a file of align for every camera, got none for {', '.join(missing)}")
     imported = [read_calibration(path, calibration_format) for path in calibrations]
     _log_imports(imported)
-    ingested = {name: read_ingested(ingest_paths[name]) for name in names_in_file}
+    ingested = {name: read_ingested(film_paths[name]) for name in names_in_file}
+    left_out = find_left_out(imported, names_in_file, ingested)
+    names_in_file = {name: given for name, given in names_in_file.items() if name not in left_out}
+    heldout = [name for name in heldout if name not in left_out]
+    inputs = check_inputs_left(names_in_file, heldout, left_out)
     selected = select_cameras(imported, names_in_file, inputs, ingested, num_frames)
     samples = sample_cameras({name: selected.tracks[name] for name in inputs})
     similarity = estimate_similarity(samples)
@@ -90,6 +105,7 @@ def run_import(
         scale=similarity.scale,
         up=estimate_up(samples) if selected.up is None else selected.up,
         depth_range_from={name: ranges[name].source for name in tracks},
+        left_out=left_out,
     )
     return scene, points
 
@@ -144,43 +160,127 @@ def parse_depth_range(words: Sequence[str] | None) -> tuple[float, float] | None
     return near, far
 
 
+def parse_scale_hint(words: Sequence[str]) -> tuple[str, str, float] | None:
+    """`["cam00", "cam01", "2.5"]` to two cameras and metres; `["none"]` and `[]` to None.
+
+    Raises InputError.
+    """
+    if list(words) in ([], ["none"]):
+        return None
+    try:
+        first, second, distance_m = words[0], words[1], float(words[2])
+    except (IndexError, ValueError):
+        first, second, distance_m = "", "", float("nan")
+    if len(words) != 3 or first == second or not 0 < distance_m < float("inf"):
+        raise InputError(
+            f"scale_hint: expected two cameras and their distance in metres, got {' '.join(words)}: correct "
+            "it in the scene file"
+        )
+    return first, second, distance_m
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The command line of the stage."""
     parser = argparse.ArgumentParser(
         prog="python -m fourd.sfm", description="Cameras of the scene, with near and far"
     )
-    command = parser.add_subparsers(dest="command", required=True).add_parser(
-        "import", help="cameras from calibration files"
-    )
-    command.add_argument("--calibration", type=Path, nargs="+", required=True, help="files or COLMAP folders")
-    command.add_argument("--calibration-format", choices=FORMATS, default="auto")
-    command.add_argument("--camera", nargs="*", default=[], metavar="NAME=NAMEINFILE", help="in scene order")
-    command.add_argument("--heldout", nargs="*", default=[], metavar="NAME")
+    commands = parser.add_subparsers(dest="command", required=True)
+    command = commands.add_parser("import", help="cameras from calibration files")
+    _add_calibration_flags(command)
     command.add_argument(
-        "--ingest", type=Path, nargs="*", default=[], help="ingest/NAME.json of every camera"
+        "--films", type=Path, nargs="*", default=[], help="align/cameras/NAME.json of every camera"
     )
     command.add_argument("--num-frames", type=int, required=True)
     command.add_argument("--fps", type=float, required=True)
     command.add_argument("--depth-range", nargs=2, metavar=("NEAR", "FAR"), help="calibration's units")
-    command.add_argument("--num-threads", type=int, default=1)
     command.add_argument("--output-cameras", type=Path, required=True)
     command.add_argument("--output-points", type=Path, required=True)
     add_options(command, SfmOptions)
+    command = commands.add_parser("films", help="known cameras over the films' own frames")
+    _add_calibration_flags(command)
+    _add_film_flags(command)
+    command = commands.add_parser("recover", help="cameras from the films alone")
+    command.add_argument("--camera", nargs="+", required=True, metavar="NAME", help="in scene order")
+    command.add_argument("--heldout", nargs="*", default=[], metavar="NAME")
+    _add_film_flags(command)
+    command.add_argument("--audio", type=Path, help="align/audio.json: clocks that narrow the films' range")
+    command.add_argument("--start-s", type=_parse_start, default=None, help="common time of frame 0")
+    command.add_argument("--num-frames", type=int, required=True)
+    command.add_argument("--fps", type=float, required=True)
+    command.add_argument("--scale-hint", nargs="*", default=[], metavar="WORD", help="CAMERA CAMERA METRES")
+    add_options(command, RecoverOptions)
+    for command in commands.choices.values():
+        command.add_argument("--num-threads", type=int, default=1)
     return parser
 
 
+def _add_calibration_flags(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--calibration", type=Path, nargs="+", required=True, help="files or COLMAP folders")
+    command.add_argument("--calibration-format", choices=FORMATS, default="auto")
+    command.add_argument("--camera", nargs="*", default=[], metavar="NAME=NAMEINFILE", help="in scene order")
+    command.add_argument("--heldout", nargs="*", default=[], metavar="NAME")
+
+
+def _add_film_flags(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--ingest", type=Path, nargs="+", required=True, help="ingest/NAME.json of every camera"
+    )
+    command.add_argument("--output", type=Path, required=True, help="sfm/film_cameras.json")
+
+
+def _parse_start(text: str) -> float | None:
+    return None if text.lower() == "none" else float(text)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
-    """Import known cameras and write cameras.json and points.npz. Raises InputError."""
+    """Run one command. Raises InputError for input that cannot be used."""
     args = build_parser().parse_args(argv)
     set_num_threads(args.num_threads)
-    if args.num_frames < 1 or not args.fps > 0:
+    if args.command != "films" and (args.num_frames < 1 or not args.fps > 0):
         raise InputError(f"expected num_frames >= 1 and fps > 0, got {args.num_frames} and {args.fps}")
+    {"import": _main_import, "films": _main_films, "recover": _main_recover}[args.command](args)
+
+
+def _main_recover(args: argparse.Namespace) -> None:
+    # COLMAP's library takes a while to load, and import has no use for it.
+    from fourd.sfm.recover.run import run_recover
+
+    run_recover(
+        dict(zip(args.camera, _paths_of(args.camera, args.ingest), strict=True)),
+        args.heldout,
+        args.audio,
+        args.start_s,
+        args.num_frames / args.fps,
+        parse_scale_hint(args.scale_hint),
+        args.output,
+        options_from_args(RecoverOptions, args),
+    )
+
+
+def _main_films(args: argparse.Namespace) -> None:
+    names = parse_camera_names(args.camera)
+    split_cameras(list(names), args.heldout)
+    imported = [read_calibration(path, args.calibration_format) for path in args.calibration]
+    _log_imports(imported)
+    paths = dict(zip(names, _paths_of(list(names), args.ingest), strict=True))
+    write_film_cameras(args.output, film_cameras_of(imported, names, args.heldout, paths))
+
+
+def _paths_of(names: Sequence[str], paths: Sequence[Path]) -> list[Path]:
+    by_name = {path.stem: path for path in paths}
+    missing = [name for name in names if name not in by_name]
+    if missing:
+        raise InputError(f"expected an ingest file for every camera, got none for {', '.join(missing)}")
+    return [by_name[name] for name in names]
+
+
+def _main_import(args: argparse.Namespace) -> None:
     scene, points = run_import(
         args.calibration,
         args.calibration_format,
         parse_camera_names(args.camera),
         args.heldout,
-        {path.stem: path for path in args.ingest},
+        {path.stem: path for path in args.films},
         args.num_frames,
         args.fps,
         parse_depth_range(args.depth_range),

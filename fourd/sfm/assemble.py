@@ -10,6 +10,7 @@ import numpy as np
 
 from fourd.camera import Camera, check_camera
 from fourd.errors import InputError
+from fourd.film_cameras import FilmCamera, FilmCameras
 from fourd.io import read_json
 from fourd.sfm.importers import DepthBounds, ImportedCameras
 
@@ -24,6 +25,7 @@ class IngestedCamera:
 
     size: (width, height) px;  source_frame: the source frame that each scene frame shows
     file_numbers: number in the name of each source image, none for a video
+    status: `ok`, or why the camera has no place on the common clock
     """
 
     path: Path
@@ -31,20 +33,23 @@ class IngestedCamera:
     num_source_frames: int
     source_frame: tuple[int, ...]
     file_numbers: tuple[int, ...] = ()
+    status: str = "ok"
 
 
 def read_ingested(path: Path | str) -> IngestedCamera:
-    """Read what is needed here of ingest/{cam}.json. Raises InputError for missing entries."""
+    """Read what is needed here of align/cameras/{cam}.json. Raises InputError for missing entries."""
     document = read_json(path)
     try:
-        size = (int(document["size"][0]), int(document["size"][1]))
+        ingest = document["ingest"]
+        size = (int(ingest["size"][0]), int(ingest["size"][1]))
         frames = tuple(int(frame) for frame in document["source_frame"])
-        digits = [re.findall(r"\d+", Path(name).stem) for name in document["files"]]
+        digits = [re.findall(r"\d+", Path(name).stem) for name in ingest["files"]]
         numbers = tuple(int(d[-1]) for d in digits) if all(digits) else ()
-        return IngestedCamera(Path(path), size, int(document["num_source_frames"]), frames, numbers)
+        count = int(ingest["num_source_frames"])
+        return IngestedCamera(Path(path), size, count, frames, numbers, str(document["status"]))
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
-            f"{path}: expected size, files, num_source_frames and source_frame of the ingest stage, got "
+            f"{path}: expected status, source_frame and the ingest document of the align stage, got "
             f"{error!r}: delete the file and run again"
         ) from None
 
@@ -99,8 +104,7 @@ def select_cameras(
         cameras = calibration.cameras[name_in_file]
         for i, camera in enumerate(cameras):
             check_camera(camera, where if len(cameras) == 1 else f"{where}, frame {i}")
-        numbers = calibration.image_numbers.get(name_in_file)
-        cameras = _at_scene_frames(cameras, numbers, ingested[name], num_frames, where)
+        cameras = _at_scene_frames(calibration, name_in_file, ingested[name], num_frames, where)
         tracks[name] = tuple(_at_size(camera, ingested[name], where) for camera in cameras)
         if name_in_file in calibration.bounds:
             bounds[name] = calibration.bounds[name_in_file]
@@ -139,9 +143,97 @@ def _find_cameras(
     return found
 
 
+def find_left_out(
+    calibrations: Sequence[ImportedCameras],
+    names_in_file: Mapping[str, str],
+    ingested: Mapping[str, IngestedCamera],
+) -> dict[str, str]:
+    """Cameras that a stage above has given up, and why: no pose or no place on the clock."""
+    reasons: dict[str, str] = {}
+    for name, name_in_file in names_in_file.items():
+        stated = [c.left_out[name_in_file] for c in calibrations if name_in_file in c.left_out]
+        if ingested[name].status != "ok":
+            stated.append(ingested[name].status)
+        if stated:
+            reasons[name] = stated[0]
+            log.warning("camera %s is left out: %s", name, stated[0])
+    return reasons
+
+
+def check_inputs_left(
+    names: Sequence[str] | Mapping[str, str], heldout: Sequence[str], left_out: Mapping[str, str]
+) -> tuple[str, ...]:
+    """Names of the input cameras that remain. Raises InputError, with the reasons, under two."""
+    inputs = tuple(name for name in names if name not in heldout)
+    if len(inputs) < 2:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+        raise InputError(
+            f"expected at least 2 input cameras, but {len(inputs)} of them remain ({reasons}): replace these "
+            "films or take others"
+        )
+    return inputs
+
+
+def film_cameras_of(
+    calibrations: Sequence[ImportedCameras],
+    names_in_file: Mapping[str, str],
+    heldout: Sequence[str],
+    ingest_paths: Mapping[str, Path],
+) -> FilmCameras:
+    """Known cameras over the films' own frames and at their sizes; what is left out stays out.
+
+    Raises InputError for whatever does not fit together.
+    """
+    left_out = {
+        name: c.left_out[given]
+        for name, given in names_in_file.items()
+        for c in calibrations
+        if given in c.left_out
+    }
+    found = _find_cameras(calibrations, {n: g for n, g in names_in_file.items() if n not in left_out})
+    films = {}
+    for name, path in ingest_paths.items():
+        document = read_json(path)
+        size = (int(document["size"][0]), int(document["size"][1]))
+        if name in left_out:
+            films[name] = FilmCamera(name, size, np.zeros(0, np.int64), (), status=left_out[name])
+            continue
+        calibration, given = found[name]
+        where = f"{calibration.path}, camera {given}"
+        count = int(document["num_source_frames"])
+        digits = [re.findall(r"\d+", Path(file).stem) for file in document["files"]]
+        numbers = tuple(int(d[-1]) for d in digits) if all(digits) else ()
+        film = IngestedCamera(path, size, count, tuple(range(count)), numbers)
+        films[name] = _film_camera(name, calibration, given, film, where)
+    inputs_in_file = {given for name, given in names_in_file.items() if name not in heldout}
+    points = [_points_of_inputs(calibration, inputs_in_file) for calibration in calibrations]
+    return FilmCameras(
+        films,
+        np.concatenate(points),
+        next((c.up for c in calibrations if c.up is not None), None),
+        next((c.metres_per_unit for c in calibrations if c.metres_per_unit is not None), None),
+        tuple(note for calibration in calibrations for note in calibration.notes),
+    )
+
+
+def _film_camera(
+    name: str, calibration: ImportedCameras, given: str, film: IngestedCamera, where: str
+) -> FilmCamera:
+    cameras, frames = calibration.cameras[given], np.arange(film.num_source_frames)
+    for camera in cameras:
+        check_camera(camera, where)
+    if calibration.has_film_frames and given in calibration.image_numbers and len(cameras) > 1:
+        frames = np.array(calibration.image_numbers[given], dtype=np.int64)
+    elif len(cameras) > 1:
+        cameras = _at_scene_frames(calibration, given, film, film.num_source_frames, where)
+    is_static = len(cameras) == 1
+    fitted = tuple(_at_size(camera, film, where) for camera in cameras)
+    return FilmCamera(name, film.size, frames[: len(cameras)], fitted, is_static)
+
+
 def _at_scene_frames(
-    cameras: tuple[Camera, ...],
-    numbers: tuple[int, ...] | None,
+    calibration: ImportedCameras,
+    name: str,
     ingested: IngestedCamera,
     num_frames: int,
     where: str,
@@ -150,8 +242,9 @@ def _at_scene_frames(
 
     A list has one pose per frame of the camera's own film, so a scene frame takes the pose of the
     source frame that it shows. A list of exactly num_frames poses beside a film of another length
-    is on the scene's clock already. numbers: of the images that the poses belong to, if known.
+    is on the scene's clock already.
     """
+    cameras, numbers = calibration.cameras[name], calibration.image_numbers.get(name)
     if len(ingested.source_frame) < num_frames:
         raise InputError(
             f"{ingested.path}: expected {num_frames} scene frames, got {len(ingested.source_frame)}: shorten "
@@ -164,6 +257,8 @@ def _at_scene_frames(
         numbers = tuple(range(len(cameras)))
         if len(cameras) == num_frames != ingested.num_source_frames:
             wanted = range(num_frames)
+    elif calibration.has_film_frames:
+        pass
     elif ingested.file_numbers:
         wanted = [ingested.file_numbers[frame] for frame in wanted]
     elif numbers[0] != 0:
@@ -208,6 +303,8 @@ def _points_of_inputs(calibration: ImportedCameras, inputs_in_file: set[str]) ->
     """(N, 3) the calibration's points that at least two images of input cameras saw."""
     if calibration.points is None:
         return np.zeros((0, 3))
+    if not calibration.num_observations:
+        return calibration.points
     seen = np.zeros(len(calibration.points), dtype=np.int64)
     for name, counts in calibration.num_observations.items():
         if name in inputs_in_file:

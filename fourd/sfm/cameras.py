@@ -19,6 +19,7 @@ class SceneCameras:
     origin: (3,), scale: similarity to the calibration's world, source = world * scale + origin
     up: (3,) unit vector, world direction that appears upward in the images
     depth_range_from: name -> `given`, `calibration`, `sparse points` or `camera geometry`
+    left_out: cameras of the scene file that have no track, and why
     """
 
     fps: float
@@ -30,6 +31,7 @@ class SceneCameras:
     scale: float
     up: np.ndarray
     depth_range_from: Mapping[str, str]
+    left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def write_cameras(path: Path | str, scene: SceneCameras) -> None:
@@ -44,6 +46,7 @@ def write_cameras(path: Path | str, scene: SceneCameras) -> None:
         "up": scene.up.tolist(),
         "inputs": list(scene.inputs),
         "heldout": list(scene.heldout),
+        "left_out": dict(scene.left_out),
         "cameras": entries,
     }
     write_json(path, document)
@@ -68,6 +71,7 @@ def read_cameras(path: Path | str) -> SceneCameras:
             scale=float(document["world"]["scale"]),
             up=np.asarray(document["up"], dtype=np.float64).reshape(3),
             depth_range_from={n: e.get("depth_range_from", "given") for n, e in document["cameras"].items()},
+            left_out={str(name): str(reason) for name, reason in document.get("left_out", {}).items()},
         )
     except InputError:
         raise

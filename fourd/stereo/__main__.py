@@ -19,7 +19,7 @@ from fourd.stereo.files import (
     read_rectification,
     write_rectification,
 )
-from fourd.stereo.rectify import STATUS_OK, RectifyOptions, rectify_tracks
+from fourd.stereo.rectify import STATUS_OK, PairRectification, RectifyOptions, rectify_tracks
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +39,12 @@ def read_tracks(cameras_path: Path, left: str, right: str) -> tuple[CameraTrack,
 
 def run_rectify(cameras_path: Path, left: str, right: str, options: RectifyOptions, output: Path) -> None:
     """Rectify a pair, or refuse it, and write the result."""
-    pair = rectify_tracks(*read_tracks(cameras_path, left, right), options)
+    left_out = io.read_json(cameras_path).get("left_out", {})
+    absent = [f"camera {name} is left out: {left_out[name]}" for name in (left, right) if name in left_out]
+    if absent:
+        pair = PairRectification(left, right, "; ".join(absent), (0, 0), float("nan"), 0)
+    else:
+        pair = rectify_tracks(*read_tracks(cameras_path, left, right), options)
     write_rectification(output, pair)
     if pair.status == STATUS_OK:
         low, high = np.array([r.disparity_range for r in pair.frames]).T
@@ -53,7 +58,7 @@ def run_rectify(cameras_path: Path, left: str, right: str, options: RectifyOptio
 
 def run_disparity(
     rectification_path: Path,
-    ingest_paths: tuple[Path, Path],
+    film_paths: tuple[Path, Path],
     cameras_path: Path,
     frames: Sequence[int],
     options: StereoOptions,
@@ -68,7 +73,7 @@ def run_disparity(
             return
         tracks = read_tracks(cameras_path, pair.left, pair.right)
         density = []
-        with open_camera(ingest_paths[0]) as left, open_camera(ingest_paths[1]) as right:
+        with open_camera(film_paths[0]) as left, open_camera(film_paths[1]) as right:
             for frame in frames:
                 disparity = match_pair(
                     pair.at(frame),
@@ -102,8 +107,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     cli.add_options(rectify, RectifyOptions)
     match = commands.add_parser("disparity", help="match frames of a rectified pair in both directions")
     match.add_argument("--rectification", type=Path, required=True)
-    match.add_argument("--left-ingest", type=Path, required=True)
-    match.add_argument("--right-ingest", type=Path, required=True)
+    match.add_argument("--left-film", type=Path, required=True)
+    match.add_argument("--right-film", type=Path, required=True)
     match.add_argument("--cameras", type=Path, required=True)
     match.add_argument("--frames", type=int, nargs="+", help="frames of the scene's clock")
     match.add_argument("--first", type=int, help="first frame, instead of --frames")
@@ -121,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     cli.set_num_threads(args.threads)
     run_disparity(
         args.rectification,
-        (args.left_ingest, args.right_ingest),
+        (args.left_film, args.right_film),
         args.cameras,
         _frames_from_args(args),
         cli.options_from_args(StereoOptions, args),

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fourd import ingest
 from fourd.camera import Camera, CameraTrack, tracks_to_dict
 from fourd.fuse import FuseOptions, PairFrame
 from fourd.geometry import look_at
 from fourd.io import ArchiveWriter, write_json, write_png
 from fourd.stereo.files import encode_confidence, encode_disparity
+from tests.films import put_on_clock
 
 SIZE = (24, 18)
 OPTIONS = FuseOptions()
@@ -137,8 +137,7 @@ def write_scene(folder: Path, num_frames: int = 2) -> dict[str, Camera]:
         for frame in range(num_frames):
             image = make_images(cameras, seed=10 * frame + i)[name]
             write_png(folder / "frames" / name / f"{frame:06d}.png", image)
-        words = f"--camera {name} --source {folder}/frames/{name} --fps 30 --num-frames {num_frames}"
-        ingest.main([*words.split(), "--output", str(folder / "ingest" / f"{name}.json")])
+        put_on_clock(folder / "frames" / name, name, folder / "films" / name / f"{name}.json", 30, num_frames)
     for pair in all_pairs(cameras, pair_from_plane, 4.0):
         write_pair(folder / "disparity" / f"{pair.left}-{pair.right}.npz", pair, range(num_frames))
     return cameras
@@ -166,5 +165,5 @@ def write_pair(path: Path, pairs: PairFrame | list[PairFrame], frames, status: s
 def stage_words(folder: Path, view: str = "orbit", frames: str = "0 1") -> list[str]:
     words = f"--view-file {folder}/views/{view}.json --cameras {folder}/cameras.json --frames {frames}"
     disparities = [str(path) for path in sorted((folder / "disparity").glob("*.npz"))]
-    ingest = [str(path) for path in sorted((folder / "ingest").glob("*.json"))]
-    return [*words.split(), "--disparity", *disparities, "--ingest", *ingest]
+    films = [str(path) for path in sorted((folder / "films").glob("cam??/cam??.json"))]
+    return [*words.split(), "--disparity", *disparities, "--films", *films]

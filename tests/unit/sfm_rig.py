@@ -53,15 +53,11 @@ def write_native(path: Path, tracks: dict[str, tuple[Camera, ...]], **extra) -> 
 
 
 def write_ingest(folder: Path, name: str, size=SIZE, num_frames=1, **changes) -> Path:
-    """ingest/{cam}.json of a film that stage sfm need not look at."""
-    document = {
-        "camera": name,
-        "size": list(size),
-        "num_source_frames": num_frames,
-        "source_frame": list(range(num_frames)),
-        "files": [],
-        **changes,
-    }
+    """align/cameras/{cam}.json of a film that stage sfm need not look at."""
+    source_frame = changes.pop("source_frame", list(range(num_frames)))
+    status = changes.pop("status", "ok")
+    ingest = {"size": list(size), "num_source_frames": num_frames, "files": [], **changes}
+    document = {"camera": name, "status": status, "source_frame": source_frame, "ingest": ingest}
     path = folder / f"{name}.json"
     path.write_text(json.dumps(document))
     return path

@@ -19,9 +19,8 @@ from fourd.composition.checkpoint import Checkpoint, StopRequest, read_torch
 from fourd.composition.infer import compose_frame, load_models, paste
 from fourd.composition.train import Trainer, train, update
 from fourd.errors import InputError
-from fourd.ingest import IngestOptions
-from fourd.ingest import run as ingest
 from fourd.sfm import SceneCameras, write_cameras
+from tests.films import put_on_clock
 
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = (32, 24)
@@ -53,8 +52,7 @@ def write_scene(folder):
         truth = [smooth_image(10 * number + f) for f in FRAMES]
         for f in FRAMES:
             io.write_png(folder / f"images/{cam}/{f:06d}.png", truth[f])
-        path = folder / f"ingest/{cam}.json"
-        ingest(cam, folder / f"images/{cam}", 30.0, len(FRAMES), 0.0, path, IngestOptions())
+        put_on_clock(folder / f"images/{cam}", cam, folder / f"films/{cam}.json", 30, len(FRAMES))
         io.write_json(folder / f"views/{cam}.json", {"role": "input", "size": list(SIZE), "frames": frames})
         for kind, keys in (("foreground", ("consensus", "closest", "median", "farthest")),
                            ("background", ("farthest", "median"))):  # fmt: skip
@@ -72,7 +70,7 @@ def write_scene(folder):
         tuple(folder / f"views/{cam}.json" for cam in CAMS),
         tuple(folder / f"foreground/{cam}/000000-000002.npz" for cam in CAMS),
         tuple(folder / f"background/{cam}/000000-000002.npz" for cam in CAMS),
-        {cam: folder / f"ingest/{cam}.json" for cam in CAMS},
+        {cam: folder / f"films/{cam}.json" for cam in CAMS},
         folder / "sfm/cameras.json",
     )
 
@@ -96,7 +94,7 @@ def command_line(sources, folder, options):
     words = ["train", "--level", "0", "--num-levels", "1", "--threads", "1", "--device", "cpu"]
     words += ["--views", *map(str, sources.views), "--foreground", *map(str, sources.foreground)]
     words += ["--background", *map(str, sources.background), "--cameras", str(sources.cameras)]
-    words += ["--ingest", *(f"{cam}={path}" for cam, path in sources.ingest.items())]
+    words += ["--films", *(f"{cam}={path}" for cam, path in sources.films.items())]
     words += ["--output-model", str(folder / "model.pt"), "--output-log", str(folder / "train.csv")]
     for key, value in dataclasses.asdict(options).items():
         values = value if isinstance(value, tuple) else ["none" if value is None else value]
@@ -116,7 +114,7 @@ def test_options_equal_the_schema():
 def test_options_survive_the_command_line(sources, tmp_path):
     args = parse(command_line(sources, tmp_path, TINY))
     assert cli.options_from_args(CompositionOptions, args) == TINY
-    assert dict(args.ingest) == sources.ingest
+    assert dict(args.films) == sources.films
 
 
 def one_sample(seed=0, side=16):
@@ -303,8 +301,8 @@ def test_heldout_view_is_never_trained_on(sources, tmp_path):
 
 
 def test_camera_without_video_is_named(sources, tmp_path):
-    with_one = dataclasses.replace(sources, ingest={"cam00": sources.ingest["cam00"]})
-    with pytest.raises(InputError, match="camera cam01 of --views in --ingest"):
+    with_one = dataclasses.replace(sources, films={"cam00": sources.films["cam00"]})
+    with pytest.raises(InputError, match="camera cam01 of --views in --films"):
         train_model(with_one, tmp_path)
 
 

@@ -16,6 +16,12 @@ from fourd.errors import InputError
 # Section of the configuration -> the options class whose flags it becomes.
 OPTIONS = {
     "ingest": "fourd.ingest.IngestOptions",
+    "align": "fourd.align.options.AlignOptions",
+    "align_vision": "fourd.align.vision_options.VisionOptions",
+    "align_spatiotemporal": "fourd.align.spatiotemporal_options.SpatiotemporalOptions",
+    "sample": "fourd.align.sample.SampleOptions",
+    "recover": "fourd.sfm.recover.options.RecoverOptions",
+    "frames": "fourd.frames.FramesOptions",
     "sfm": "fourd.sfm.SfmOptions",
     "rectify": "fourd.stereo.volume.RectifyOptions",
     "stereo": "fourd.stereo.check.StereoOptions",

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fourd import config, ingest
+from fourd import config
 from fourd.camera import Camera, CameraTrack, tracks_to_dict
 from fourd.cli import run_stage
 from fourd.errors import InputError
@@ -37,6 +37,7 @@ from fourd.stereo.rectify import (
     rectify_pair,
     rectify_tracks,
 )
+from tests.films import put_on_clock
 from tests.unit.test_rectify import LENS, on_arc
 
 NEAR, FAR = 3.0, 8.0
@@ -228,10 +229,7 @@ class TestCommandLine:
         for name, camera in cameras.items():
             for frame in range(2):
                 write_png(tmp_path / name / f"{frame:06d}.png", render(camera)[0])
-            ingest.main(
-                ["--camera", name, "--source", str(tmp_path / name), "--fps", "30", "--num-frames", "2"]
-                + ["--output", str(tmp_path / f"{name}.json")]
-            )
+            put_on_clock(tmp_path / name, name, tmp_path / f"{name}.json", 30, 2)
         tracks = {name: CameraTrack(name, (camera,), NEAR, FAR) for name, camera in cameras.items()}
         write_json(tmp_path / "cameras.json", {"fps": 30, "num_frames": 2, "cameras": tracks_to_dict(tracks)})
         return tmp_path
@@ -253,7 +251,7 @@ class TestCommandLine:
                 "--cameras",
                 str(scene / "cameras.json"),
             ]
-            + ["--left-ingest", str(scene / "cam00.json"), "--right-ingest", str(scene / f"{right}.json")]
+            + ["--left-film", str(scene / "cam00.json"), "--right-film", str(scene / f"{right}.json")]
             + [*frames, "--output", str(scene / "disparity.npz")],
         )
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from fourd import cli, ingest, io, metrics, views
+from fourd import cli, io, metrics, views
 from fourd.baselines import METHODS, Evidence, nn_same_time
 from fourd.camera import Camera, CameraTrack
 from fourd.errors import InputError
@@ -18,6 +18,7 @@ from fourd.evaluate.camera import COLUMNS, score_image
 from fourd.geometry import look_at
 from fourd.image import undistort
 from fourd.sfm import SceneCameras, write_cameras
+from tests.films import put_on_clock
 
 SIZE = (96, 64)
 SCHEMA = Path(__file__).resolve().parents[2] / "config" / "schemas" / "evaluate.schema.yaml"
@@ -48,9 +49,7 @@ def make_scene(folder: Path) -> None:
         tracks[name] = CameraTrack(name, (Camera(K, R, t, SIZE),), 1.0, 9.0)
         for frame in range(3):
             io.write_png(folder / "source" / name / f"{frame:06d}.png", filmed(name, frame))
-        ingest.run(
-            name, folder / "source" / name, 30.0, 3, 0.0, folder / f"{name}.json", ingest.IngestOptions()
-        )
+        put_on_clock(folder / "source" / name, name, folder / f"{name}.json", 30, 3)
     inputs = tuple(n for n in NAMES if n != HELDOUT)
     scene = SceneCameras(
         30.0,
@@ -116,7 +115,7 @@ def camera_command(folder: Path, output: Path, **changes) -> list[str]:
         "labels": folder / "labels",
         **{key.replace("_", "-"): value for key, value in changes.items()},
     }
-    command = ["camera", "--ingest", *(f"{name}={folder / name}.json" for name in NAMES)]
+    command = ["camera", "--films", *(f"{name}={folder / name}.json" for name in NAMES)]
     for key, value in files.items():
         command += [] if value is None else [f"--{key}", str(value)]
     return [*command, "--output", str(output / "cam01.csv"), "--output-sheet", str(output / "cam01.png")]
@@ -325,7 +324,7 @@ def test_missing_files_are_named(scene, tmp_path):
     with pytest.raises(InputError, match="000000.png"):
         main(camera_command(scene, tmp_path, labels=tmp_path / "empty"))
     command = [word for word in camera_command(scene, tmp_path) if not word.startswith("cam03=")]
-    with pytest.raises(InputError, match="expected camera cam03 in --ingest"):
+    with pytest.raises(InputError, match="expected camera cam03 in --films"):
         main(command)
     with pytest.raises(InputError, match="expected the scores of a camera"):
         table.read_metrics(tmp_path / "none.csv")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
-import fourd.ingest
 from fourd.cli import run_stage
 from fourd.errors import InputError
+from fourd.ingest.__main__ import main as ingest_main
 from fourd.io import Archive, write_png
 from fourd.sfm import SfmOptions, read_cameras, write_cameras
 from fourd.sfm.__main__ import main, parse_camera_names, parse_depth_range
@@ -36,7 +36,7 @@ SCHEMA_PATH = Path(__file__).resolve().parents[2] / "config" / "schemas" / "sfm.
 def import_arguments(folder: Path, calibration: Path, names, heldout=(), num_frames=1, extra=()) -> list[str]:
     return [
         *["import", "--calibration", str(calibration), "--camera", *names, "--heldout", *heldout],
-        *["--num-frames", str(num_frames), "--fps", "30", "--ingest"],
+        *["--num-frames", str(num_frames), "--fps", "30", "--films"],
         *[str(folder / f"{name.partition('=')[0]}.json") for name in names],
         *["--output-cameras", str(folder / "sfm" / "cameras.json")],
         *["--output-points", str(folder / "sfm" / "points.npz"), *extra],
@@ -164,9 +164,11 @@ def filmed(tmp_path_factory):
     for name, camera in rig.items():
         write_png(folder / "frames" / name / "000000.png", render_planes(camera, wall_and_box(), texture))
         source, output = str(folder / "frames" / name), str(folder / f"{name}.json")
-        fourd.ingest.main(
-            ["--camera", name, "--source", source, "--fps", "30", "--num-frames", "1", "--output", output]
-        )
+        flags = ["--camera", name, "--source", source, "--fps", "30", "--output-json", output]
+        ingest_main([*flags, "--output-table", str(folder / f"{name}.csv")])
+        film = {"camera": name, "status": "ok", "rate_ppm": 0.0, "source_frame": [0], "dt_s": [0.0]}
+        ingest = json.loads((folder / f"{name}.json").read_text())
+        (folder / f"{name}.json").write_text(json.dumps({"schema_version": 1, **film, "ingest": ingest}))
     return folder, rig
 
 
@@ -288,8 +290,8 @@ def test_too_few_input_cameras_are_refused(tmp_path, capsys):
         (
             ["cam00", "cam01"],
             [],
-            ["--ingest"],
-            "expected an ingest file for every camera, got none for cam00, cam01",
+            ["--films"],
+            "expected a file of align for every camera, got none for cam00, cam01",
         ),
     ],
 )
@@ -343,7 +345,7 @@ def test_flags():
 
 def test_a_file_that_is_no_ingest_file_is_refused(tmp_path):
     (tmp_path / "cam00.json").write_text('{"size": [1]}')
-    with pytest.raises(InputError, match=r"cam00\.json: expected size, files"):
+    with pytest.raises(InputError, match=r"cam00\.json: expected status, source_frame"):
         read_ingested(tmp_path / "cam00.json")
 
 

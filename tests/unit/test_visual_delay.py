@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fourd.align.clock_graph import solve_clocks
-from fourd.align.film_motion import FilmMotion, no_motion
+from fourd.align.moving_tracks import MovingTracks, no_tracks
 from fourd.align.track_groups import group_tracks, join_observations
 from fourd.align.vision_options import VisionOptions
 from fourd.align.visual_delay import (
@@ -34,7 +34,7 @@ def make_film(name: str, angle_deg: float) -> FilmCamera:
     return FilmCamera(name, SIZE, np.array([0]), (Camera(K, R, t, SIZE),), is_static=True)
 
 
-def make_motion(film: FilmCamera, offset_s: float, seed: int = 0, noise_px: float = 0.3) -> FilmMotion:
+def make_motion(film: FilmCamera, offset_s: float, seed: int = 0, noise_px: float = 0.3) -> MovingTracks:
     """Forty points that swing and walk, seen by one film; the same seed is the same event."""
     event, own = np.random.default_rng(seed), np.random.default_rng(abs(hash(film.name)) % 1000 + seed)
     start, speed = event.uniform(-1, 1, (40, 3)), event.uniform(-0.6, 0.6, (40, 3))
@@ -52,7 +52,7 @@ def make_motion(film: FilmCamera, offset_s: float, seed: int = 0, noise_px: floa
     noisy = looks + own.normal(0, 0.02, looks.shape).astype(np.float32)
     noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
     span = (float(pts_s[0]), float(pts_s[-1]))
-    return FilmMotion(
+    return MovingTracks(
         film.name, "ok", span, track, frame, pts_s[frame], pixels[frame, track], noisy, np.arange(40)
     )
 
@@ -99,7 +99,7 @@ def test_points_that_look_alike_but_belong_to_another_event_are_refused():
 
 def test_film_in_which_nothing_moves_is_named():
     films = make_film("cam00", 0), make_film("cam01", 15)
-    match = estimate(make_motion(films[0], 0.0), no_motion("cam01", "nothing in it moves"), films)
+    match = estimate(make_motion(films[0], 0.0), no_tracks("cam01", "nothing in it moves"), films)
     assert match.delay.status == "cam01: nothing in it moves"
 
 

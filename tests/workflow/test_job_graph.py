@@ -25,6 +25,7 @@ def large_scene(workspace: Workspace, num_cameras: int, num_frames: int) -> dict
         "num_frames": num_frames,
         "size": [1920, 1080],
         "cameras": {name: {"source": name} for name in names},
+        "clock": "given",
         "calibration": ["cameras"],
     }
 

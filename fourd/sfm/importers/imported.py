@@ -33,10 +33,14 @@ class ImportedCameras:
     cameras: name -> one camera (it stands still) or one per frame of its own
     image_numbers: camera name -> number of the image that each of its cameras belongs to, for files
     that name images; without an entry the cameras are those of frames 0, 1, 2 ...
+    has_film_frames: the numbers are frames of the film, counted from 0
+    left_out: camera name -> why the file has no camera for it
     points: (N, 3) sparse points, if the file has them
-    num_observations: camera name -> (N,) images of that camera in which each point was seen
+    num_observations: camera name -> (N,) images of that camera in which each point was seen; empty where
+    all points come from input cameras
     bounds: camera name -> depths of what it films, in the file's units
     up: (3,) world direction that is up, if the file says so
+    metres_per_unit: metric scale of the file's world, if the file says so
     notes: what a user should know about how the file was read
     """
 
@@ -48,6 +52,9 @@ class ImportedCameras:
     bounds: Mapping[str, DepthBounds] = dataclasses.field(default_factory=dict)
     up: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    has_film_frames: bool = False
+    left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    metres_per_unit: float | None = None
 
 
 def assign_image_names(names: Iterable[str], where: str) -> dict[str, tuple[str, int]]:

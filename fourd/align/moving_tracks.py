@@ -43,7 +43,7 @@ class Pictures(Protocol):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FilmMotion:
+class MovingTracks:
     """Tracks of moving points in one film.
 
     track, frame: (N,) int64 of every observation, grouped by track, frames rising within it
@@ -68,26 +68,26 @@ class FilmMotion:
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
 
-def no_motion(name: str, status: str) -> FilmMotion:
+def no_tracks(name: str, status: str) -> MovingTracks:
     """A film that says nothing, and why."""
     empty = np.zeros(0, np.int64)
-    return FilmMotion(
+    return MovingTracks(
         name, status, (0.0, 0.0), empty, empty, np.zeros(0), np.zeros((0, 2)),
         np.zeros((0, 128), np.float32), empty,
     )  # fmt: skip
 
 
-def find_motion(reader: Pictures, film: FilmCamera, options: VisionOptions) -> FilmMotion:
+def track_motion(reader: Pictures, film: FilmCamera, options: VisionOptions) -> MovingTracks:
     """Track the moving points of a film over the frames whose camera is known.
 
     A film without cameras, of a single frame, or in which nothing moves gives an empty result with a
     status.
     """
     if film.status != "ok":
-        return no_motion(film.name, f"its cameras are not known: {film.status}")
+        return no_tracks(film.name, f"its cameras are not known: {film.status}")
     frames = np.arange(len(reader.pts_s)) if film.is_static else film.source_frames
     if len(frames) < options.min_track_frames:
-        return no_motion(film.name, f"{len(frames)} frames with a known camera are too few to see motion")
+        return no_tracks(film.name, f"{len(frames)} frames with a known camera are too few to see motion")
     tracker = _Tracker(film, options, min(1.0, options.work_px / max(film.size)))
     for block in _blocks(reader.pts_s, frames):
         still, reference = _median_picture(reader, film, block, frames)
@@ -97,7 +97,7 @@ def find_motion(reader: Pictures, film: FilmCamera, options: VisionOptions) -> F
             tracker.step(int(frame), picture, _moving_mask(picture, camera, still, reference))
     tracks = tracker.finish()
     if not tracks:
-        return no_motion(film.name, "nothing in it moves by itself, as far as can be seen")
+        return no_tracks(film.name, "nothing in it moves by itself, as far as can be seen")
     pts_s = np.asarray(reader.pts_s)
     span_s = float(pts_s[frames[0]]), float(pts_s[frames[-1]])
     return _join_tracks(film.name, tracks, tracker, pts_s, span_s, options)
@@ -267,7 +267,7 @@ def _join_tracks(
     pts_s: np.ndarray,
     span_s: tuple[float, float],
     options: VisionOptions,
-) -> FilmMotion:
+) -> MovingTracks:
     frame = np.concatenate([t.frames for t in tracks])
     # Descriptors of one track from different times tell it from different sides; few are enough.
     share = max(1, options.max_descriptors // len(tracks))
@@ -281,7 +281,7 @@ def _join_tracks(
     raw = np.concatenate([np.stack(c) for c in chosen]).astype(np.float32)
     # Square roots of shares compare histograms as Hellinger does (Arandjelovic and Zisserman 2012).
     descriptors = np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1))
-    return FilmMotion(
+    return MovingTracks(
         name=name,
         status="ok",
         span_s=span_s,
@@ -297,7 +297,7 @@ def _join_tracks(
 _ARRAYS = ("track", "frame", "own_s", "pixels", "descriptors", "descriptor_track")
 
 
-def write_motion(path: Path | str, motion: FilmMotion) -> None:
+def write_tracks(path: Path | str, motion: MovingTracks) -> None:
     """Write align/motion/{cam}.npz."""
     meta = {"name": motion.name, "status": motion.status, "span_s": list(motion.span_s)}
     with ArchiveWriter(path, meta) as writer:
@@ -305,13 +305,13 @@ def write_motion(path: Path | str, motion: FilmMotion) -> None:
             writer.add(key, getattr(motion, key))
 
 
-def read_motion(path: Path | str) -> FilmMotion:
-    """Inverse of `write_motion`. Raises InputError, naming the file."""
+def read_tracks(path: Path | str) -> MovingTracks:
+    """Inverse of `write_tracks`. Raises InputError, naming the file."""
     archive = Archive(path)
     try:
         meta = archive.meta
         arrays = {key: archive[key] for key in _ARRAYS}
-        return FilmMotion(meta["name"], meta["status"], (meta["span_s"][0], meta["span_s"][1]), **arrays)
+        return MovingTracks(meta["name"], meta["status"], (meta["span_s"][0], meta["span_s"][1]), **arrays)
     except KeyError as error:
         raise InputError(
             f"expected the motion of a film in {path}, it lacks {error}: delete it and run again"

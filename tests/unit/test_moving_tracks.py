@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fourd.align.film_motion import find_motion, no_motion, read_motion, write_motion
+from fourd.align.moving_tracks import no_tracks, read_tracks, track_motion, write_tracks
 from fourd.align.vision_options import VisionOptions
 from fourd.camera import Camera
 from fourd.errors import InputError
@@ -46,7 +46,7 @@ class Film:
 
 def test_points_of_the_mover_are_followed_where_they_go():
     film = Film()
-    motion = find_motion(film, film.film(), VisionOptions())
+    motion = track_motion(film, film.film(), VisionOptions())
     assert motion.status == "ok" and motion.num_tracks >= 10
     # Every observation of one track is the same point of the square.
     errors = []
@@ -64,7 +64,7 @@ def test_points_of_the_mover_are_followed_where_they_go():
 
 def test_film_in_which_nothing_moves_has_no_tracks_and_says_so():
     film = Film(moves=False)
-    motion = find_motion(film, film.film(), VisionOptions())
+    motion = track_motion(film, film.film(), VisionOptions())
     assert motion.num_tracks == 0
     assert "nothing in it moves" in motion.status
 
@@ -80,16 +80,16 @@ def test_film_in_which_nothing_moves_has_no_tracks_and_says_so():
     ],
 )
 def test_films_that_cannot_tell_have_the_reason(film, expected):
-    motion = find_motion(Film(), film, VisionOptions())
+    motion = track_motion(Film(), film, VisionOptions())
     assert expected in motion.status and motion.num_tracks == 0
 
 
 def test_motion_reads_back_equal(tmp_path):
     film = Film()
-    motion = find_motion(film, film.film(), VisionOptions())
-    for given in (motion, no_motion("cam01", "nothing in it moves")):
-        write_motion(tmp_path / "motion.npz", given)
-        again = read_motion(tmp_path / "motion.npz")
+    motion = track_motion(film, film.film(), VisionOptions())
+    for given in (motion, no_tracks("cam01", "nothing in it moves")):
+        write_tracks(tmp_path / "motion.npz", given)
+        again = read_tracks(tmp_path / "motion.npz")
         assert (again.name, again.status, again.span_s) == (given.name, given.status, given.span_s)
         for key in ("track", "frame", "own_s", "pixels", "descriptors", "descriptor_track"):
             np.testing.assert_array_equal(getattr(again, key), getattr(given, key))
@@ -98,7 +98,7 @@ def test_motion_reads_back_equal(tmp_path):
 def test_same_film_gives_the_same_bytes(tmp_path):
     for name in ("a.npz", "b.npz"):
         film = Film()
-        write_motion(tmp_path / name, find_motion(film, film.film(), VisionOptions()))
+        write_tracks(tmp_path / name, track_motion(film, film.film(), VisionOptions()))
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
@@ -106,4 +106,4 @@ def test_other_files_are_refused(tmp_path):
     path = tmp_path / "motion.npz"
     path.write_bytes(b"no archive")
     with pytest.raises(InputError, match="expected a whole archive"):
-        read_motion(path)
+        read_tracks(path)

@@ -1,0 +1,121 @@
+"""Cameras placed against finished landmarks: held-out ones, and inputs that the mapper left out."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from fourd.sfm.recover.adjust import adjust
+from fourd.sfm.recover.evidence import choose_lens
+from fourd.sfm.recover.films import Film
+from fourd.sfm.recover.mapping import Features
+from fourd.sfm.recover.model import ImageKey, Lens, Model
+from fourd.sfm.recover.options import RecoverOptions
+from fourd.sfm.recover.tracking import Landmarks, estimate_pose, observe
+from fourd.sfm.sparse import match_descriptors
+
+# A landmark and a feature this close in a picture are the same corner.
+SAME_CORNER_PX = 1.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DescribedLandmarks:
+    """descriptors: (N, 128) and landmark: (N,) of the features of one keyframe that are landmarks."""
+
+    descriptors: np.ndarray
+    landmark: np.ndarray
+
+
+def describe_landmarks(model: Model, features: Mapping[ImageKey, Features]) -> list[DescribedLandmarks]:
+    """Descriptors of the model's landmarks, one entry per keyframe."""
+    described = []
+    for i, image in enumerate(model.images):
+        rows = np.flatnonzero(model.obs_image == i)
+        if image not in features or len(rows) == 0:
+            continue
+        distance, nearest = KDTree(features[image].pixels).query(model.obs_px[rows])
+        near, nearest = distance <= SAME_CORNER_PX, np.asarray(nearest)
+        described.append(
+            DescribedLandmarks(features[image].descriptors[nearest[near]], model.obs_point[rows[near]])
+        )
+    return described
+
+
+def register_keyframe(
+    features: Features,
+    described: list[DescribedLandmarks],
+    points: np.ndarray,
+    lens: Lens,
+    options: RecoverOptions,
+) -> tuple[np.ndarray, Lens] | None:
+    """Pose (3, 4) and lens of a picture from its matches with the landmarks; None if it has too few."""
+    pairs = [np.zeros((0, 2), dtype=np.int64)]
+    for view in described:
+        matches = match_descriptors(features.descriptors, view.descriptors, options.match_ratio)
+        pairs.append(np.stack([matches[:, 0], view.landmark[matches[:, 1]]], axis=1))
+    unique = np.unique(np.concatenate(pairs), axis=0)
+    pixels, seen = features.pixels[unique[:, 0]], points[unique[:, 1]]
+    found = estimate_pose(pixels, seen, lens, options.max_match_error_px, is_focal_known=False)
+    if found is None or found[2].sum() < options.min_matches:
+        return None
+    return found[0], found[1]
+
+
+def register_remaining(
+    model: Model,
+    landmarks: Landmarks,
+    films: Mapping[str, Film],
+    features: Mapping[ImageKey, Features],
+    lenses: Mapping[str, Lens],
+    options: RecoverOptions,
+) -> Model:
+    """The model of the keyframes with those films, too, that match it only as a whole.
+
+    A film that sees a little in common with each of several cameras has no pair of pictures with
+    enough matches, but may have enough landmarks. lenses: start of the intrinsics
+    """
+    described = describe_landmarks(model, features)
+    for name, film in films.items():
+        if name not in model.cameras:
+            placed = register_film(film, features, described, landmarks, lenses[name], options)
+            model = model if placed is None else model.joined(placed)
+    return model
+
+
+def register_film(
+    film: Film,
+    features: Mapping[ImageKey, Features],
+    described: list[DescribedLandmarks],
+    landmarks: Landmarks,
+    lens: Lens,
+    options: RecoverOptions,
+) -> Model | None:
+    """Keyframes of one film in the landmarks' world, with its lens; None if none could be placed.
+
+    The model has the landmarks as points, to the last bit.
+    """
+    found = {
+        key: register_keyframe(features[key], described, landmarks.points, lens, options)
+        for key in sorted(features)
+        if key[0] == film.name
+    }
+    placed = {key: value for key, value in found.items() if value is not None}
+    if not placed:
+        return None
+    focal_px = float(np.median([lens.focal_px for _, lens in placed.values()]))
+    start = dataclasses.replace(lens, focal_px=focal_px)
+    nothing = np.zeros(0, dtype=np.int64)
+    poses = {key: pose for key, (pose, _) in placed.items()}
+    model = Model({film.name: start}, poses, landmarks.points, nothing, nothing, np.zeros((0, 2)))
+    for _ in range(2):
+        model = observe(
+            model, landmarks, lambda _, frame: film.read_gray(frame), model.images, options.min_patch_score
+        )
+        if len(model.obs_px) < options.min_matches:
+            return None
+        model = adjust(model, options.loss_scale_px, is_scene_fixed=True)
+    chosen = dataclasses.replace(model, lenses={film.name: choose_lens(model, options.loss_scale_px)})
+    model = adjust(chosen, options.loss_scale_px, is_scene_fixed=True)
+    error = np.linalg.norm(model.residuals_px(), axis=1)
+    return model.select(error <= options.max_error_px)

@@ -1,0 +1,183 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from fourd.align.clock import CameraClock, Offsets
+from fourd.errors import InputError
+from fourd.film_cameras import FilmCameras, write_film_cameras
+from fourd.sfm.__main__ import parse_scale_hint
+from fourd.sfm.compare import align_similarity
+from fourd.sfm.recover.films import focal_guess_px, select_frames
+from fourd.sfm.recover.options import RecoverOptions
+from fourd.sfm.recover.recover import recover_cameras
+from tests.unit.recover_films import draw_films, film_of
+
+SCHEMA_PATH = Path(__file__).resolve().parents[2] / "config" / "schemas" / "recover.schema.yaml"
+OPTIONS = RecoverOptions(num_keyframes=2)
+
+
+def errors_of(found: FilmCameras, truth, names):
+    pairs = [
+        (camera, truth[name][int(frame)])
+        for name in names
+        for frame, camera in zip(found.cameras[name].source_frames, found.cameras[name].cameras, strict=True)
+    ]
+    return align_similarity([p[0] for p in pairs], [p[1] for p in pairs])
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return draw_films()
+
+
+@pytest.fixture(scope="module")
+def recovered(drawn):
+    return recover_cameras(drawn[0], ["cam03"], ("cam00", "cam02", 3.0), OPTIONS)
+
+
+def test_options_and_schema_agree():
+    schema = yaml.safe_load(SCHEMA_PATH.read_text())
+    defaults = {key: entry["default"] for key, entry in schema["properties"].items()}
+    assert defaults == dataclasses.asdict(RecoverOptions())
+    assert schema["additionalProperties"] is False
+
+
+def test_every_frame_of_every_film_is_placed(drawn, recovered):
+    films, truth = drawn
+    assert [camera.status for camera in recovered.cameras.values()] == ["ok"] * 4
+    for film in recovered.cameras.values():
+        assert film.source_frames.tolist() == [0, 1, 2, 3, 4] and not film.is_static
+        assert film.reprojection_error_px < 0.3
+        assert not film.cameras[0].is_distorted
+    errors = errors_of(recovered, truth, list(films))
+    assert np.median(errors.rotation_deg) < 0.1 and errors.rotation_deg.max() < 0.2
+    assert np.median(errors.center / errors.distance) < 0.0025
+    assert np.abs(errors.focal).max() < 0.005
+
+
+def test_up_and_scale_of_the_world(recovered, drawn):
+    # The world's up is the direction that the true cameras' pictures show as up.
+    camera, true = recovered.cameras["cam01"].cameras[2], drawn[1]["cam01"][2]
+    np.testing.assert_allclose(camera.R @ recovered.up, true.R @ [0, 0, 1], atol=0.03)
+    centers = [np.mean([c.center for c in recovered.cameras[n].cameras], axis=0) for n in ("cam00", "cam02")]
+    assert np.linalg.norm(centers[0] - centers[1]) * recovered.metres_per_unit == pytest.approx(3.0)
+
+
+def test_a_heldout_film_changes_nothing_and_the_bytes_repeat(drawn, recovered, tmp_path):
+    films = drawn[0]
+    write_film_cameras(tmp_path / "all.json", recovered)
+    blank = film_of("cam03", [np.full((240, 320, 3), 90, np.uint8)] * 5)
+    without = recover_cameras({**films, "cam03": blank}, ["cam03"], None, OPTIONS)
+    assert "constant" in without.cameras["cam03"].status
+    np.testing.assert_array_equal(without.points, recovered.points)
+    np.testing.assert_array_equal(without.up, recovered.up)
+    for name in ("cam00", "cam01", "cam02"):
+        for a, b in zip(without.cameras[name].cameras, recovered.cameras[name].cameras, strict=True):
+            assert a.to_dict() == b.to_dict()
+    # The same films once more: the same bytes, held-out film included.
+    again = recover_cameras(films, ["cam03"], ("cam00", "cam02", 3.0), OPTIONS)
+    write_film_cameras(tmp_path / "again.json", again)
+    assert (tmp_path / "all.json").read_bytes() == (tmp_path / "again.json").read_bytes()
+
+
+def test_a_distorting_lens_is_found_where_there_is_one():
+    films, truth = draw_films(3, 2, radial=-0.12)
+    found = recover_cameras(films, [], None, OPTIONS)
+    for film in found.cameras.values():
+        assert film.cameras[0].distortion[0] == pytest.approx(-0.12, abs=0.03)
+    assert errors_of(found, truth, list(films)).rotation_deg.max() < 0.3
+
+
+def test_a_tripod_is_one_pose(drawn):
+    still, still_truth = draw_films(1, 1)
+    noisy = np.random.default_rng(0)
+    picture = still["cam00"].source.read(0).astype(np.float64)
+    pictures = [
+        np.clip(picture + noisy.normal(0, 2, picture.shape), 0, 255).astype(np.uint8) for _ in range(5)
+    ]
+    films = {**{n: drawn[0][n] for n in ("cam01", "cam02")}, "cam00": film_of("cam00", pictures)}
+    found = recover_cameras(films, [], None, OPTIONS)
+    assert found.cameras["cam00"].is_static and len(found.cameras["cam00"].cameras) == 1
+    assert not found.cameras["cam01"].is_static
+    truth = {**drawn[1], "cam00": still_truth["cam00"]}
+    assert errors_of(found, truth, list(films)).rotation_deg.max() < 0.25
+
+
+def test_a_mirrored_film_and_another_place_are_left_out_by_name(drawn):
+    films = dict(drawn[0])
+    films["cam02"] = film_of("cam02", [p[:, ::-1].copy() for p in films["cam02"].source.pictures])
+    other = np.random.default_rng(1).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    films["cam04"] = film_of("cam04", [other] * 5)
+    found = recover_cameras(films, [], None, OPTIONS)
+    assert found.cameras["cam02"].status.startswith("the film is mirrored")
+    assert "matches no other camera" in found.cameras["cam04"].status
+    assert [found.cameras[n].status for n in ("cam00", "cam01", "cam03")] == ["ok"] * 3
+    assert any(note.startswith("cam02 is left out: the film is mirrored") for note in found.notes)
+
+
+def test_a_turned_film_is_placed_and_named(drawn):
+    films = dict(drawn[0])
+    films["cam01"] = film_of("cam01", [np.rot90(p).copy() for p in films["cam01"].source.pictures])
+    found = recover_cameras(films, [], None, OPTIONS)
+    assert found.cameras["cam01"].status == "ok"
+    assert [note for note in found.notes if "cam01 is turned by about" in note and "rotation flag" in note]
+
+
+def test_a_short_gap_is_bridged_and_a_long_one_is_named(drawn):
+    films, truth = draw_films(3, 12)
+    blank = np.full((240, 320, 3), 90, np.uint8)
+    pictures = list(films["cam01"].source.pictures)
+    pictures[4] = blank
+    found = recover_cameras({**films, "cam01": film_of("cam01", pictures)}, [], None, OPTIONS)
+    assert found.cameras["cam01"].source_frames.tolist() == list(range(12))
+    assert "cam01: the poses of frames 4 are interpolated" in found.notes
+    assert errors_of(found, truth, list(films)).rotation_deg.max() < 0.5
+    pictures[4:9] = [blank] * 5
+    long_gap = film_of("cam01", pictures, wanted=(2, 11))
+    found = recover_cameras({**films, "cam01": long_gap}, [], None, OPTIONS)
+    assert found.cameras["cam01"].status == "no pose could be found for frames 4-8"
+
+
+def test_one_input_film_is_refused(drawn):
+    films = {name: drawn[0][name] for name in ("cam00", "cam01")}
+    with pytest.raises(InputError, match=r"at least 2 input cameras, got 1 \(cam00\)"):
+        recover_cameras(films, ["cam01"], None, OPTIONS)
+
+
+def test_films_of_different_places_are_refused_with_the_reasons(drawn):
+    blank = film_of("cam01", [np.full((240, 320, 3), 90, np.uint8)] * 5)
+    with pytest.raises(InputError, match="cam01: the picture is constant"):
+        recover_cameras({"cam00": drawn[0]["cam00"], "cam01": blank}, [], None, OPTIONS)
+
+
+def test_cameras_at_one_place_are_refused_or_named():
+    films, _ = draw_films(1, 4, shake=0.0)
+    pictures = films["cam00"].source.pictures
+    same = {name: film_of(name, pictures) for name in ("cam00", "cam01", "cam02")}
+    try:
+        notes = " ".join(recover_cameras(same, [], None, OPTIONS).notes)
+    except InputError as error:
+        notes = str(error)
+    assert "one place" in notes or "turned on the spot" in notes
+
+
+def test_frames_are_narrowed_to_the_scene_by_the_sound():
+    pts_s = np.arange(300) / 30
+    clocks = Offsets("cam00", {"cam00": CameraClock(-4.0), "cam01": CameraClock(0, status="silent")}, 0.0)
+    frames, wanted = select_frames("cam00", pts_s, clocks, None, 1.0, 0.5)
+    assert (frames[0], frames[-1], wanted) == (105, 165, (120, 150))
+    assert select_frames("cam01", pts_s, clocks, None, 1.0, 0.5)[0].tolist() == list(range(300))
+    assert len(select_frames("cam00", pts_s, clocks, 100.0, 1.0, 0.5)[0]) == 0
+
+
+def test_focal_start_and_scale_hint_words():
+    assert focal_guess_px((3600, 2400), 50.0) == pytest.approx(5000, rel=1e-3)
+    assert focal_guess_px((200, 100), None) == focal_guess_px((100, 200), 0.0)
+    assert parse_scale_hint(["none"]) is None
+    assert parse_scale_hint(["a", "b", "2.5"]) == ("a", "b", 2.5)
+    for words in (["a", "b"], ["a", "a", "1"], ["a", "b", "-1"], ["a", "b", "c"]):
+        with pytest.raises(InputError, match="two cameras and their distance"):
+            parse_scale_hint(words)
