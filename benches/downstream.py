@@ -23,7 +23,7 @@ from fourd.image import undistort
 from fourd.io import Archive, read_image, read_json, write_csv, write_json
 from fourd.metrics import psnr_from_mse, squared_error
 from fourd.sfm import read_cameras
-from fourd.sfm.compare import align_similarity
+from fourd.sfm.compare import fit_similarity
 from fourd.views import read_view
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -126,7 +126,7 @@ def recovered_truth(phones: dict, results: Path) -> tuple[dict, dict]:
         for frame in films[name].source_frames:
             found.append(films[name].at(int(frame)))
             true.append(camera_from_dict(phones[name]["frames"][frame], films[name].size, name))
-    similarity = align_similarity(found, true)
+    similarity = fit_similarity(found, true)
     shift = np.median([phones[name]["start_time_s"] - clocks[name].offset_s for name in names])
     offsets = {name: float(clocks[name].offset_s + shift) for name in names}
     tracks = {}

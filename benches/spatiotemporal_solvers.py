@@ -194,12 +194,8 @@ def error_frames(take: Take, offsets_s: np.ndarray) -> float:
     return float(np.abs(offsets_s - take.offsets_s[1:]).max() * FPS)
 
 
-def solve_ceres(fit: Fit, box_s: float, epsilon_s: float, num_orders: int = 4) -> np.ndarray | None:
-    """Offsets by Ceres with the discrete prior, sorted anew `num_orders` times; None without pyceres."""
-    try:
-        import pyceres
-    except ImportError:
-        return None
+def _ceres_costs(pyceres, fit: Fit, epsilon_s: float) -> tuple[type, type]:
+    """Cost functions of an observation and of a step between two positions of one point."""
     observations = fit.observations
     matrix, pixels, sigma_px = observations.projection, observations.pixels, observations.sigma_px
     own_s, cams = observations.own_s, observations.cam
@@ -246,6 +242,18 @@ def solve_ceres(fit: Fit, box_s: float, epsilon_s: float, num_orders: int = 4) -
                         slot[:] = slope.ravel()
             return True
 
+    return Sighting, Step
+
+
+def solve_ceres(fit: Fit, box_s: float, epsilon_s: float, num_orders: int = 4) -> np.ndarray | None:
+    """Offsets by Ceres with the discrete prior, sorted anew `num_orders` times; None without pyceres."""
+    try:
+        import pyceres
+    except ImportError:
+        return None
+    sighting, step = _ceres_costs(pyceres, fit, epsilon_s)
+    observations = fit.observations
+    own_s, cams = observations.own_s, observations.cam
     offsets = [np.array([value]) for value in fit.clocks.offset_s]
     times = fit.clocks.times(observations)
     positions = [row.copy() for row in fit.grid.evaluate(fit.coefficients, observations.point, times)]
@@ -254,13 +262,13 @@ def solve_ceres(fit: Fit, box_s: float, epsilon_s: float, num_orders: int = 4) -
         order = np.lexsort((times, observations.point))
         problem = pyceres.Problem()
         for k in range(len(positions)):
-            problem.add_residual_block(Sighting(k), None, [positions[k]])
+            problem.add_residual_block(sighting(k), None, [positions[k]])
         for before, after in zip(order[:-1], order[1:], strict=True):
             if observations.point[before] == observations.point[after]:
                 blocks = [positions[before], positions[after]]
                 if cams[before] != cams[after]:
                     blocks += [offsets[cams[before]], offsets[cams[after]]]
-                problem.add_residual_block(Step(int(before), int(after)), None, blocks)
+                problem.add_residual_block(step(int(before), int(after)), None, blocks)
         problem.set_parameter_block_constant(offsets[0])
         for offset, guess in zip(offsets[1:], fit.clocks.offset_s[1:], strict=True):
             if problem.has_parameter_block(offset):

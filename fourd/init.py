@@ -164,23 +164,7 @@ def scene_text(name: str, draft: SceneDraft) -> str:
         + (f", calibration_name: {_scalar(calibrated)}}}" if calibrated else "}")
         for camera, (source, calibrated) in draft.cameras.items()
     ]
-    if draft.calibration:
-        calibration = [
-            "# Files or folders with K, R, t of all cameras in one world; the format is recognised.",
-            f"calibration: [{', '.join(map(_scalar, draft.calibration))}]",
-        ]
-    else:
-        calibration = [
-            "# Nothing is known about where the cameras stood: the videos tell. If you have a calibration:",
-            "# calibration: [colmap/sparse/0]",
-        ]
-    if draft.is_synchronized:
-        clock = ["# All sources start together; where one does not, give it its offset_s.", "clock: given"]
-    else:
-        clock = [
-            "# When each camera started is found from sound and motion. If you know: `clock: given`, and",
-            "# offset_s for every camera.",
-        ]
+    clock, calibration = _known_lines(draft)
     few_cameras = []
     if len(draft.cameras) < FEW_CAMERAS:
         few_cameras = [
@@ -218,6 +202,28 @@ def scene_text(name: str, draft: SceneDraft) -> str:
         "  composition: {num_filters: [8, 8, 8], crop: 192, epochs: 6, test_input_share: 0.75}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _known_lines(draft: SceneDraft) -> tuple[list[str], list[str]]:
+    """What the scene file says about clocks and about cameras."""
+    if draft.calibration:
+        calibration = [
+            "# Files or folders with K, R, t of all cameras in one world; the format is recognised.",
+            f"calibration: [{', '.join(map(_scalar, draft.calibration))}]",
+        ]
+    else:
+        calibration = [
+            "# Nothing is known about where the cameras stood: the videos tell. If you have a calibration:",
+            "# calibration: [colmap/sparse/0]",
+        ]
+    if draft.is_synchronized:
+        clock = ["# All sources start together; where one does not, give it its offset_s.", "clock: given"]
+    else:
+        clock = [
+            "# When each camera started is found from sound and motion. If you know: `clock: given`, and",
+            "# offset_s for every camera.",
+        ]
+    return clock, calibration
 
 
 def _scalar(text: str) -> str:

@@ -27,11 +27,11 @@ def room():
     ]
 
 
-def draw(camera: Camera, planes) -> np.ndarray:
+def draw(camera: Camera, planes, textures=TEXTURES) -> np.ndarray:
     """(H, W, 3) uint8, drawn at twice the size so that edges are smooth."""
     large = camera.resized((2 * camera.size[0], 2 * camera.size[1])).without_distortion()
     image = np.full((large.size[1], large.size[0], 3), 30, np.uint8)
-    for plane, texture in zip(planes, TEXTURES, strict=False):
+    for plane, texture in zip(planes, textures, strict=False):
         layer = render_planes(large, [plane], texture)
         image = np.where(layer.any(axis=2, keepdims=True), layer, image)
     image = cv2.resize(image, camera.size, interpolation=cv2.INTER_AREA)
@@ -82,11 +82,16 @@ def film_of(name: str, pictures: list[np.ndarray], wanted=None) -> Film:
     return Film(name, source, np.arange(len(pictures)), 0.85 * max(source.size), wanted)
 
 
-def draw_films(num_cameras=4, num_frames=5, shake=0.02, radial=0.0, planes=None):
+def first_frames(films: dict[str, Film], names, count: int) -> dict[str, Film]:
+    """The beginnings of drawn films."""
+    return {name: film_of(name, films[name].source.pictures[:count]) for name in names}
+
+
+def draw_films(num_cameras=4, num_frames=5, shake=0.02, radial=0.0, planes=None, textures=TEXTURES):
     """Films by name and their true cameras (name -> list)."""
     truth = {f"cam{i:02d}": make_cameras(i, num_frames, shake, radial) for i in range(num_cameras)}
     films = {
-        name: film_of(name, [draw(camera, planes or room()) for camera in track])
+        name: film_of(name, [draw(camera, planes or room(), textures) for camera in track])
         for name, track in truth.items()
     }
     return films, truth

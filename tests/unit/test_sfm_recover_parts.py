@@ -1,5 +1,7 @@
 """The parts of camera recovery by themselves, where answers are known in closed form."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -9,12 +11,17 @@ from fourd.camera import Camera
 from fourd.geometry import look_at
 from fourd.sfm.compare import align_similarity, fit_similarity
 from fourd.sfm.recover.adjust import adjust
+from fourd.sfm.recover.diagnose import describe_geometry
 from fourd.sfm.recover.evidence import choose_lens, sub_model
 from fourd.sfm.recover.frames import bridge_gaps, longest_run
+from fourd.sfm.recover.mapping import Features, map_keyframes, match_keyframes
 from fourd.sfm.recover.model import Lens, Model, to_reconstruction
+from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.recover.patches import align_patches, extract_templates
-from fourd.sfm.recover.tracking import affine_between
-from tests.unit.recover_films import make_cameras
+from fourd.sfm.recover.register import register_remaining
+from fourd.sfm.recover.tracking import affine_between, cut_landmarks
+from fourd.sfm.sparse import detect_features
+from tests.unit.recover_films import draw_films, make_cameras
 from tests.unit.sfm_rig import make_texture
 
 
@@ -95,6 +102,50 @@ def test_the_plainest_lens_that_explains_the_points_is_chosen(radial, expected):
     lens = choose_lens(sub_model(model, "cam1"), 0.3)
     assert len(lens.radial) == expected
     assert lens.focal_px == pytest.approx(300, rel=2e-3)
+
+
+def described(points: np.ndarray, moves: dict[str, np.ndarray]) -> str:
+    """Notes about three cameras that see `points`; `moves` shifts a camera's centre."""
+    model, _ = make_model()
+    poses = {}
+    for key, pose in model.poses.items():
+        center = -pose[:, :3].T @ pose[:, 3] + moves.get(key[0], np.zeros(3))
+        poses[key] = np.concatenate([pose[:, :3], (-pose[:, :3] @ center)[:, None]], axis=1)
+    return " ".join(describe_geometry(dataclasses.replace(model, poses=poses, points=points)))
+
+
+def test_degenerate_geometry_is_named_and_sound_geometry_is_not():
+    points = make_model()[1]
+    assert described(points, {}) == ""
+    assert "all points lie on one plane (a wall)" in described(points * [1, 0.002, 1], {})
+    far_away = described(points, {"cam2": np.array([0.0, -40, 0])})
+    assert "cam2 is " in far_away and "times as far away as the typical camera" in far_away
+    # All cameras 4 in front of the scene become cameras 400 in front of it.
+    assert "the cameras stand almost at one place" in described(points + [0, 400, 0], {})
+
+
+@pytest.mark.parametrize("is_shared", [False, True])
+def test_a_camera_joins_the_model_through_landmarks_alone(is_shared):
+    films, truth = draw_films(4, 1)
+    options = RecoverOptions(num_keyframes=1, max_features=500, shared_lens=is_shared)
+    features = {(name, 0): Features(*detect_features(film.read_rgb(0), 500)) for name, film in films.items()}
+    lenses = {name: Lens(film.size, 300.0) for name, film in films.items()}
+    without = {key: value for key, value in features.items() if key[0] != "cam03"}
+    pairs = match_keyframes(without, lenses, options)
+    three = {name: lenses[name] for name in ("cam00", "cam01", "cam02")}
+    model = map_keyframes(without, pairs, three, options)[0].supported().compact()
+    landmarks = cut_landmarks(model, lambda name, frame: films[name].read_gray(frame), 7)
+    grown = register_remaining(model, landmarks, films, features, lenses, options)
+    assert grown.cameras == ["cam00", "cam01", "cam02", "cam03"]
+    np.testing.assert_array_equal(grown.points, model.points)
+    assert (grown.obs_image == 3).sum() >= options.min_matches
+    assert (grown.lenses["cam03"] == grown.lenses["cam00"]) is is_shared
+    adjusted = adjust(grown, 0.3)
+    errors = align_similarity(
+        [adjusted.camera(k) for k in adjusted.images], [truth[k[0]][0] for k in grown.images]
+    )
+    assert errors.rotation_deg[3] < 0.5
+    assert register_remaining(grown, landmarks, films, features, lenses, options) is grown
 
 
 def test_points_of_one_camera_alone_support_nothing():
