@@ -153,7 +153,8 @@ def record(
     wave = scipy.ndimage.map_coordinates(event, at[None], order=3, mode="constant")
     if unlike:
         gains = 10 ** (rng.uniform(-10, 10, 12) / 20)
-        wave = scipy.signal.lfilter(scipy.signal.firwin2(255, np.linspace(0, 1, 12), gains), 1, wave)
+        response = scipy.signal.firwin2(255, np.linspace(0, 1, 12), gains)
+        wave = np.asarray(scipy.signal.lfilter(response, 1, wave))
     level = wave.std()
     if muted:
         first = int(rng.uniform(0, 1 - muted) * count)

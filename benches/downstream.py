@@ -3,8 +3,9 @@
 DIR is a rendered event with truth: inputs_phones/CAM.mp4, truth/phones.json (clock, K, R, t of every
 phone frame), truth/heldout/VIEW/000000.png with truth/heldout_cameras.json, truth/labels. Each variant
 is a scene of its own that the workflow fuses for the held-out views; scored is the consensus over the
-background, before any network. `recovered` takes clocks and cameras from a finished scene of the same
-phones (--recovered results/SCENE), brought to the truth by one similarity and one shift of time.
+background where there is either, before any network. `recovered` takes clocks and cameras from a
+finished scene of the same phones (--recovered results/SCENE), brought to the truth by one similarity
+and one shift of time.
 """
 
 import argparse
@@ -29,8 +30,9 @@ from fourd.views import read_view
 REPOSITORY = Path(__file__).resolve().parents[1]
 FIRST_FRAME = 2
 NUM_FRAMES = 28
-HELDOUT_FRAMES = 6
-COLUMNS = ("variant", "view", "region", "psnr_db", "num_frames")
+HELDOUT_FRAMES = 3
+NUM_SAMPLES = 5
+COLUMNS = ("variant", "view", "region", "psnr_db", "coverage", "num_frames")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +105,7 @@ def write_scene(folder: Path, event: Path, variant: Variant, recovered: Path | N
         "settings": {
             "chunk_frames": 1,
             "views": {"heldout_frames": HELDOUT_FRAMES},
+            "background": {"num_samples": NUM_SAMPLES},
             "fuse": {"min_pairs": 2},
             "sample": {"max_dt_frames": 4},
             "frames": {"compensate": variant.is_compensated, "match_colours": False},
@@ -176,6 +179,7 @@ def score(folder: Path, event: Path, view_name: str, variant: str) -> list[dict]
     view = read_view(results / "views" / f"{view_name}.json")
     on_disk = next(p for p in (event / "truth" / "heldout").iterdir() if p.name.lower() == view_name)
     errors: dict[str, list[float]] = {"full": [], "dynamic": []}
+    coverage: list[float] = []
     for entry in view.frames:
         name = f"{entry.frame:06d}-{entry.frame:06d}.npz"
         foreground = Archive(results / "foreground" / view_name / name).frame(entry.frame)
@@ -187,6 +191,9 @@ def score(folder: Path, event: Path, view_name: str, variant: str) -> list[dict]
         moving = labels[..., 0] > 0
         image = np.where(background["farthest_valid"][..., None], background["farthest_rgb"], 0)
         image = np.where(foreground["consensus_valid"][..., None], foreground["consensus_rgb"], image)
+        covered = foreground["consensus_valid"] | background["farthest_valid"]
+        valid &= covered
+        coverage.append(float(covered.mean()))
         squared = squared_error(image.astype(np.uint8), truth)
         errors["full"].append(psnr_from_mse(float(squared[valid].mean())))
         if (moving & valid).any():
@@ -197,6 +204,7 @@ def score(folder: Path, event: Path, view_name: str, variant: str) -> list[dict]
             "view": view_name,
             "region": k,
             "psnr_db": f"{np.mean(v):.2f}",
+            "coverage": f"{np.mean(coverage):.3f}",
             "num_frames": len(v),
         }
         for k, v in errors.items()

@@ -18,7 +18,8 @@ from fourd.align.delay_line import MAX_RATE_PPM, Line, fit_line
 from fourd.align.options import AlignOptions
 from fourd.align.sound import BAND_RATE_HZ, HIGH_HZ, LOW_HZ, NUM_BANDS, RATE_HZ, Sound
 
-# Exponent of the whitening: 1 is the phase transform, 0 plain correlation (benches/audio_sync.py).
+# Exponent of the whitening: 1 is the phase transform, 0 plain correlation. From 0.7 on it makes no
+# difference that can be measured, below it rooms suffer (benches/audio_sync.py, part `rooms`).
 WHITENING = 0.9
 MIN_OVERLAP_S = 0.4
 NUM_CANDIDATES = 5
@@ -36,14 +37,15 @@ BAND_TOLERANCE_S, WAVE_TOLERANCE_S = 0.02, 0.0015
 BAND_SIGMA_S, WAVE_SIGMA_S = 4e-3, 1e-4
 # A room moves the loudness of all windows alike, so that their agreement does not show it.
 BAND_BIAS_S = 2e-3
-# Odds that a lag is that of the direct sound go with the summed correlation to this power; chosen so that
-# 95 % of the errors in rooms stay within two sigma (benches/audio_sync.py, part `rooms`).
-LAG_POWER = 7
+# Odds that another lag up to MAX_LATE_S, 7 m of detour, is that of the direct sound go with the summed
+# correlation to this power: 94 % of the errors in rooms are within two sigma (benches/audio_sync.py).
+MAX_LATE_S, LAG_POWER = 0.02, 4
 # Log-odds that a delay is right: constant, log prominence of the search, and for waveforms log height
-# of the windows' sum and share of agreeing windows, for bands log height of the search. Fitted to
-# related and unrelated recordings (benches/audio_sync.py, table `score`).
-WAVE_ODDS = (-9.4, 4.0, 0.8, 7.5)
-BAND_ODDS = (-6.5, 4.5, 1.0)
+# of the windows' sum and share of agreeing windows, for bands log height of the search. Fitted to 480
+# recordings, half of them unrelated; on 240 others, score 0.5 accepts 2 of 120 unrelated ones and refuses
+# 8 of 120 related ones (benches/audio_sync.py, part `score`).
+WAVE_ODDS = (-8.4, 4.3, 1.1, 6.3)
+BAND_ODDS = (-6.8, 3.6, 1.5)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -337,6 +339,7 @@ def _spread_of_lags(lags_s: np.ndarray, total: np.ndarray) -> float:
 
     Windows that all lock to the same reflection agree with each other; only the sum's other peaks tell.
     """
+    lags_s, total = (values[np.abs(lags_s) <= MAX_LATE_S] for values in (lags_s, total))
     chance = (np.maximum(total, 0) / max(float(total.max()), 1e-12)) ** LAG_POWER
     return math.sqrt(float((chance * lags_s**2).sum()) / max(float(chance.sum()), 1e-12))
 

@@ -224,6 +224,11 @@ def _film_camera(
         check_camera(camera, where)
     if calibration.has_film_frames and given in calibration.image_numbers and len(cameras) > 1:
         frames = np.array(calibration.image_numbers[given], dtype=np.int64)
+        if frames[-1] >= film.num_source_frames:
+            raise InputError(
+                f"{where}: expected poses of frames below {film.num_source_frames}, which the film of "
+                f"{film.path} has, got one of frame {frames[-1]}: take the film that was calibrated"
+            )
     elif len(cameras) > 1:
         cameras = _at_scene_frames(calibration, given, film, film.num_source_frames, where)
     is_static = len(cameras) == 1

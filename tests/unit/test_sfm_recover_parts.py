@@ -124,10 +124,9 @@ def test_degenerate_geometry_is_named_and_sound_geometry_is_not():
     assert "the cameras stand almost at one place" in described(points + [0, 400, 0], {})
 
 
-@pytest.mark.parametrize("is_shared", [False, True])
-def test_a_camera_joins_the_model_through_landmarks_alone(is_shared):
+def test_a_camera_joins_the_model_through_landmarks_alone():
     films, truth = draw_films(4, 1)
-    options = RecoverOptions(num_keyframes=1, max_features=500, shared_lens=is_shared)
+    options = RecoverOptions(num_keyframes=1, max_features=500)
     features = {(name, 0): Features(*detect_features(film.read_rgb(0), 500)) for name, film in films.items()}
     lenses = {name: Lens(film.size, 300.0) for name, film in films.items()}
     without = {key: value for key, value in features.items() if key[0] != "cam03"}
@@ -139,13 +138,30 @@ def test_a_camera_joins_the_model_through_landmarks_alone(is_shared):
     assert grown.cameras == ["cam00", "cam01", "cam02", "cam03"]
     np.testing.assert_array_equal(grown.points, model.points)
     assert (grown.obs_image == 3).sum() >= options.min_matches
-    assert (grown.lenses["cam03"] == grown.lenses["cam00"]) is is_shared
     adjusted = adjust(grown, 0.3)
     errors = align_similarity(
         [adjusted.camera(k) for k in adjusted.images], [truth[k[0]][0] for k in grown.images]
     )
     assert errors.rotation_deg[3] < 0.5
     assert register_remaining(grown, landmarks, films, features, lenses, options) is grown
+
+
+def test_a_shared_lens_is_adjusted_as_one_and_given_to_who_joins():
+    model, _ = make_model()
+    model = dataclasses.replace(
+        model, lenses=dict.fromkeys(model.lenses, Lens((320, 240), 306.0)), is_lens_shared=True
+    )
+    assert to_reconstruction(model).num_cameras() == 1
+    found = adjust(model, 1.0)
+    assert len(set(found.lenses.values())) == 1
+    assert found.lenses["cam1"].focal_px == pytest.approx(300, abs=1e-2)
+    other = sub_model(make_model()[0], "cam2")
+    newcomer = dataclasses.replace(
+        other, lenses={"new": other.lenses["cam2"]}, poses={("new", 0): np.eye(3, 4)}
+    )
+    joined = found.joined(newcomer.select(newcomer.obs_image == 0))
+    assert joined.lenses["new"] == found.lenses["cam0"]
+    assert joined.camera(joined.images[joined.obs_image[-1]]).center.tolist() == [0, 0, 0]
 
 
 def test_points_of_one_camera_alone_support_nothing():
