@@ -97,7 +97,7 @@ def film_cameras_command():
     if SCENE.calibration:
         names = [f"{cam}={source.calibration_name}" for cam, source in SCENE.cameras.items()]
         given = {"calibration": SCENE.calibration, "calibration_format": SCENE.calibration_format}
-        return "films " + flags_from_mapping({"camera": names, **given})
+        return f"films {flags_from_mapping({'camera': names, **given})}"
     flags = {"camera": list(SCENE.cameras), "fps": SCENE.fps, "num_frames": SCENE.num_frames}
     flags |= {"start_s": SCENE.start_s, "scale_hint": SCENE.scale_hint}
     if not SCENE.clock_is_given:
