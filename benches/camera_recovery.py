@@ -2,8 +2,8 @@
 
     python -m benches.camera_recovery --output DIR [--setting NAME ...] [--data NAME ...]
 
-`demo` is data/demo/phones; `studio` and `fountain` are measured where ../shared/data has them, and
-skipped with a message where not. `fountain_shared` are the same stills with one lens for all.
+`demo` is data/demo/phones; `studio` and `fountain` are measured where that footage lies beside the
+project, and skipped with a message where not. `fountain_shared` are the same stills with one lens for all.
 Every setting differs from the default by the values in SETTINGS, or leaves out a step of SKIPPED.
 Prints a table and writes camera_recovery.csv.
 """

@@ -11,13 +11,11 @@ and one shift of time.
 import argparse
 import dataclasses
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from benches import workspace
 from fourd.align.clock import read_offsets
 from fourd.film_cameras import read_film_cameras
 from fourd.image import undistort
@@ -27,7 +25,6 @@ from fourd.sfm import read_cameras
 from fourd.sfm.compare import fit_similarity
 from fourd.views import read_view
 
-REPOSITORY = Path(__file__).resolve().parents[1]
 FIRST_FRAME = 2
 NUM_FRAMES = 28
 HELDOUT_FRAMES = 3
@@ -111,9 +108,7 @@ def write_scene(folder: Path, event: Path, variant: Variant, recovered: Path | N
             "frames": {"compensate": variant.is_compensated, "match_colours": False},
         },
     }
-    (folder / "config" / "scenes").mkdir(parents=True, exist_ok=True)
-    (folder / "config" / "config.yaml").write_text(yaml.safe_dump({"scene": "event"}))
-    (folder / "config" / "scenes" / "event.yaml").write_text(yaml.safe_dump(scene, sort_keys=False))
+    workspace.write_scene(folder, "event", scene)
     return scene["heldout"]
 
 
@@ -152,24 +147,6 @@ def delay_pictures(folder: Path, lag_frames: int) -> None:
             document["dt_s"][i] += pts_s[late] - pts_s[frame]
             document["source_frame"][i] = late
         path.write_text(json.dumps(document))
-
-
-def run_workflow(folder: Path, cores: int, *targets: str) -> None:
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(REPOSITORY / "Snakefile")]
-    command += [
-        "--workflow-profile",
-        "none",
-        "--scheduler",
-        "greedy",
-        "--cores",
-        str(cores),
-        "--quiet",
-        "all",
-    ]
-    command += ["--rerun-triggers", "mtime", "--show-failed-logs", *targets]
-    subprocess.run(
-        command, cwd=folder, check=True, env={"PYTHONPATH": str(REPOSITORY), **__import__("os").environ}
-    )
 
 
 def score(folder: Path, event: Path, view_name: str, variant: str) -> list[dict]:
@@ -226,14 +203,14 @@ def main() -> None:
         folder = args.output / variant.name.replace(",", "").replace(" ", "_")
         views = write_scene(folder, args.event.resolve(), variant, args.recovered)
         stems = [f"results/event/align/cameras/{n.lower()}.json" for n in [*phone_truth(args.event), *views]]
-        run_workflow(folder, args.cores, *stems)
+        workspace.run_workflow(folder, args.cores, *stems)
         if variant.lag_frames:
             delay_pictures(folder, variant.lag_frames)
         from fourd.config import spread_frames
 
         chunks = [f"{f:06d}-{f:06d}.npz" for f in spread_frames(NUM_FRAMES, HELDOUT_FRAMES)]
         kinds = ("foreground", "background")
-        run_workflow(
+        workspace.run_workflow(
             folder, args.cores, *(f"results/event/{k}/{v}/{c}" for k in kinds for v in views for c in chunks)
         )
         for view in views:

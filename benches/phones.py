@@ -7,22 +7,18 @@ away first. Clock errors are relative to the reference camera, and once more wit
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import av
 import numpy as np
-import yaml
 
+from benches import workspace
 from fourd.align.clock import read_offsets
 from fourd.camera import camera_from_dict
 from fourd.film_cameras import read_film_cameras
 from fourd.io import write_csv
 from fourd.sfm.compare import align_similarity
 
-REPOSITORY = Path(__file__).resolve().parents[1]
 COLUMNS = ("quantity", "median", "p95", "max", "unit")
 
 
@@ -45,25 +41,7 @@ def write_workspace(folder: Path, films: dict[str, Path], num_frames: int, heldo
         "cameras": {name: {"source": str(path)} for name, path in films.items()},
         "heldout": heldout,
     }
-    (folder / "config" / "scenes").mkdir(parents=True, exist_ok=True)
-    (folder / "config" / "config.yaml").write_text(yaml.safe_dump({"scene": "phones"}))
-    (folder / "config" / "scenes" / "phones.yaml").write_text(yaml.safe_dump(scene, sort_keys=False))
-
-
-def run_workflow(folder: Path, cores: int, *targets: str) -> None:
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(REPOSITORY / "Snakefile")]
-    command += [
-        "--workflow-profile",
-        "none",
-        "--scheduler",
-        "greedy",
-        "--cores",
-        str(cores),
-        "--quiet",
-        "all",
-    ]
-    command += ["--show-failed-logs", *targets]
-    subprocess.run(command, cwd=folder, check=True, env={**os.environ, "PYTHONPATH": str(REPOSITORY)})
+    workspace.write_scene(folder, "phones", scene)
 
 
 def summarize(quantity: str, values: np.ndarray, unit: str) -> dict[str, str]:
@@ -93,7 +71,7 @@ def main() -> None:
             mute(path, args.output / "muted" / f"{name}.mp4")
             films[name] = (args.output / "muted" / f"{name}.mp4").resolve()
     write_workspace(args.output, films, args.num_frames, args.heldout)
-    run_workflow(args.output, args.cores, "results/phones/align/offsets.json")
+    workspace.run_workflow(args.output, args.cores, "results/phones/align/offsets.json")
     results = args.output / "results" / "phones"
     offsets = read_offsets(results / "align" / "offsets.json")
     cameras = read_film_cameras(results / "sfm" / "film_cameras.json").cameras
