@@ -23,6 +23,7 @@ from fourd.geometry import convergence_point
 
 NUM_PLANES = 96
 COARSE_STEP_S, FINE_STEP_S = 1 / 60, 1 / 240
+SMOOTH_FRAMES = 1.0
 # Films that share less time than this are not compared, s.
 MIN_OVERLAP_S, MIN_COMMON = 0.5, 6
 # Peaks this far from the highest one belong to other offsets, s.
@@ -132,7 +133,9 @@ def motion_on_planes(left: MotionMaps, right: MotionMaps) -> tuple[np.ndarray, n
     for film, maps in zip(angles, (left.maps, right.maps), strict=True):
         rows = [_sum_over_planes(m, a, lowest, highest) for m, a in zip(maps, film, strict=True)]
         table = np.sqrt(np.stack(rows)).astype(np.float32)
-        tables.append(cv2.GaussianBlur(table, (0, 0), sigmaX=1.0, sigmaY=1e-3))
+        # Over time, too: between frames the spline averages noise away, which would favour offsets of half
+        # a frame over whole ones.
+        tables.append(cv2.GaussianBlur(table, (0, 0), sigmaX=1.0, sigmaY=SMOOTH_FRAMES))
     return tables[0], tables[1]
 
 

@@ -18,6 +18,8 @@ from fourd.align.listen import (
     solve_by_sound,
 )
 from fourd.align.options import AlignOptions
+from fourd.demo.options import DemoOptions
+from fourd.demo.truth import describe_phones
 from fourd.errors import InputError
 from tests.unit.test_audio_delay import crowd, hear
 
@@ -169,7 +171,7 @@ def test_evidence_is_a_picture_and_the_same_each_time(films: dict[str, Path]) ->
 
 @pytest.mark.skipif(not (DEMO / "phones").is_dir(), reason="the demo's phones are not made yet")
 def test_demo_phones_within_two_milliseconds(tmp_path: Path) -> None:
-    truth = json.loads((DEMO / "truth" / "phones.json").read_text())
+    truth = describe_phones(DemoOptions())
     names = sorted(path.stem for path in (DEMO / "phones").glob("*.mp4"))
     paths = [ingest(tmp_path, name, DEMO / "phones" / f"{name}.mp4") for name in names]
     offsets, _ = run_listen(paths, names[:-2], names[-2:], FPS, 30, AlignOptions())
