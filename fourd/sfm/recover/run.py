@@ -1,15 +1,17 @@
 """Files of `recover`: films in, film_cameras.json out."""
 
 import contextlib
+import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from fourd.align.clock import read_offsets
 from fourd.errors import InputError
-from fourd.film_cameras import write_film_cameras
+from fourd.film_cameras import FilmCamera, write_film_cameras
 from fourd.ingest import open_source
 from fourd.io import read_json
 from fourd.sfm.recover.films import Film, focal_guess_px, select_frames
@@ -48,13 +50,27 @@ def run_recover(
     pycolmap.logging.minloglevel = _ONLY_FATAL
     clocks = None if audio_path is None else read_offsets(audio_path)
     with contextlib.ExitStack() as stack:
-        films = {}
-        for name, path in ingest_paths.items():
+        films: dict[str, Film] = {}
+        copies: dict[str, FilmCamera] = {}
+        first_with: dict[str, str] = {}
+        # Held-out films last: of two equal ones the input is the original.
+        for name in sorted(ingest_paths, key=lambda name: name in heldout):
+            path = ingest_paths[name]
+            document = read_json(path)
+            original = first_with.setdefault(str(document["sha256"]), name)
+            if original != name:
+                size = (int(document["size"][0]), int(document["size"][1]))
+                status = f"same recording as {original}: no second view of anything"
+                copies[name] = FilmCamera(name, size, np.zeros(0, np.int64), (), status=status)
+                continue
             source = stack.enter_context(open_source(path))
             frames, wanted = select_frames(name, source.pts_s, clocks, start_s, duration_s, options.margin_s)
-            focal_px = focal_guess_px(source.size, read_json(path).get("focal_35mm_mm"))
+            focal_px = focal_guess_px(source.size, document.get("focal_35mm_mm"))
             films[name] = Film(name, source, frames, focal_px, wanted)
-        found = recover_cameras(films, heldout, scale_hint, options)
+        given = {name: films[name] for name in ingest_paths if name in films}
+        found = recover_cameras(given, [n for n in heldout if n in films], scale_hint, options)
+    cameras = {name: copies.get(name) or found.cameras[name] for name in ingest_paths}
+    found = dataclasses.replace(found, cameras=cameras)
     for note in found.notes:
         log.warning("%s", note)
     write_film_cameras(output, found)
