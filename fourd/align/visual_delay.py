@@ -51,6 +51,17 @@ class VisualMatch:
     fine_s: np.ndarray
     cost: np.ndarray
 
+    def turned(self) -> "VisualMatch":
+        """The same with left and right exchanged."""
+        old = self.delay
+        delay = dataclasses.replace(
+            old, left=old.right, right=old.left, delay_s=-old.delay_s, time_s=old.time_s + old.delay_s
+        )
+        return VisualMatch(
+            delay, -self.offsets_s[::-1], self.votes[::-1], self.tracks[:, ::-1], -self.fine_s[::-1],
+            self.cost[::-1],
+        )  # fmt: skip
+
 
 def match_tracks(left: MovingTracks, right: MovingTracks) -> np.ndarray:
     """(M, 2) int64 tracks of both films that look alike, each pair once, sorted.
@@ -186,6 +197,10 @@ def estimate_visual_delay(
     rays: `rays_of_tracks` of both;  search_s: least and largest offset_s of right minus left
     The delay's status says why there is none: nothing moves, nothing matches, no offset stands out.
     """
+    # The film with more frames is interpolated; of equals the later by name, so that order says nothing.
+    if (_frame_s(left), right.name) < (_frame_s(right), left.name):
+        turned = estimate_visual_delay(right, left, (rays[1], rays[0]), (-search_s[1], -search_s[0]), options)
+        return turned.turned()
     pairs = match_tracks(left, right)
     offsets = np.arange(search_s[0], search_s[1] + COARSE_STEP_S / 2, COARSE_STEP_S)
     silent = next((f"{m.name}: {m.status}" for m in (left, right) if m.status != "ok"), None)
@@ -216,6 +231,12 @@ def estimate_visual_delay(
     time_s = float(right.own_s[seen].mean())
     delay = PairDelay(left.name, right.name, delay_s, sigma_s, score, "vision", time_s=time_s)
     return VisualMatch(delay, offsets, votes, agree, fine, squared[complete].mean(axis=0))
+
+
+def _frame_s(motion: MovingTracks) -> float:
+    """Usual time from frame to frame, s, to a microsecond; 0 where nothing was seen."""
+    times = np.unique(motion.own_s)
+    return round(float(np.median(np.diff(times))), 6) if len(times) > 1 else 0.0
 
 
 def score_votes(votes: float, elsewhere: float) -> float:

@@ -21,7 +21,7 @@ from fourd.sfm.compare import align_similarity
 from fourd.video import read_video_frames
 from tests.conftest import Workspace
 
-EVENT = DemoOptions(num_cameras=5, num_frames=15, arc_deg=44)
+EVENT = DemoOptions(num_cameras=5, num_frames=18, width=320, height=180, arc_deg=44, samples_per_axis=1)
 GOOD = tuple(camera_names(EVENT))
 HELDOUT = "cam02"
 # Film -> what the reason for leaving it out must say.
@@ -60,7 +60,7 @@ def write_bad_films(folder: Path) -> None:
     noise = [rng.integers(0, 256, pictures[0].shape, dtype=np.uint8) for _ in range(20)]
     write_film(folder / "other.mp4", noise, 0.2 * rng.standard_normal(SAMPLE_RATE))
     shutil.copy(folder / "cam00.mp4", folder / "copy.mp4")
-    write_film(folder / "single.mp4", pictures[7:8])
+    write_film(folder / "single.mp4", pictures[:1])
     write_film(folder / "covered.mp4", [np.full_like(pictures[0], 12)] * 20, np.zeros(SAMPLE_RATE))
 
 
@@ -76,7 +76,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     scene = {
         "fps": 30,
         "num_frames": EVENT.num_frames,
-        "size": [480, 270],
+        "size": [320, 180],
         "cameras": {name: {"source": f"films/{name}.mp4"} for name in (*GOOD, *BAD)},
         "heldout": [HELDOUT],
         "settings": {"align_vision": {"use": "always"}},
