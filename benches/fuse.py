@@ -95,8 +95,10 @@ def make_pair(names: tuple[str, str], cameras: dict[str, Camera], rng: np.random
         disparity, confidence = match(rectified, depths, i, float(np.linalg.norm(baseline)), rng)
         maps[f"{side}_disparity"], maps[f"{side}_confidence"] = disparity, confidence
     return PairFrame(
-        *names, K_left=left.K, K_right=left.K, R=R, center_left=left.center, center_right=right.center,
-        baseline=float(np.linalg.norm(baseline)), sigma_px=SIGMA_PX, **maps,
+        *names, K_left=left.K, K_right=left.K, R_left=R, R_right=R, center_left=left.center,
+        center_right=right.center, disparity_at_infinity=(0.0, 0.0),
+        inverse_depth_per_px=(float(1 / (left.K[0, 0] * np.linalg.norm(baseline))),) * 2,
+        sigma_px=SIGMA_PX, **maps,
     )  # fmt: skip
 
 

@@ -26,8 +26,9 @@ def read_pair_frame(archive: Archive, frame: int) -> PairFrame:
     found = read_disparity_frame(archive, frame)
     geometry = found.rectification
     return PairFrame(
-        archive.meta["left"], archive.meta["right"], geometry.K_left, geometry.K_right, geometry.R,
-        geometry.center_left, geometry.center_right, geometry.baseline, found.left_disparity,
+        archive.meta["left"], archive.meta["right"], geometry.K_left, geometry.K_right,
+        geometry.R_left, geometry.R_right, geometry.center_left, geometry.center_right,
+        geometry.disparity_at_infinity, geometry.inverse_depth_per_px, found.left_disparity,
         found.right_disparity, found.left_confidence, found.right_confidence, found.sigma_px,
     )  # fmt: skip
 

@@ -21,19 +21,24 @@ from fourd.fuse.options import MAX_REACH_PX
 class PairFrame:
     """The disparities of one pair at one frame, with what places them in the world.
 
-    left, right: names of the cameras;  K_left, K_right, R: (3, 3), R is rectified_from_world
-    center_left, center_right: (3,) world;  baseline: world units;  sigma_px: noise at confidence 1
+    left, right: names of the cameras;  K_*, R_*: (3, 3), R is rectified_from_world
+    center_*: (3,) world;  sigma_px: noise at confidence 1
+    disparity_at_infinity, inverse_depth_per_px: of the left and the right map; 1 / depth is
+        (disparity - disparity_at_infinity) * inverse_depth_per_px
     *_disparity: (H, W) float32 px, NaN where invalid;  *_confidence: (H, W) float32 in 0..1
+    The two maps may differ in size.
     """
 
     left: str
     right: str
     K_left: np.ndarray
     K_right: np.ndarray
-    R: np.ndarray
+    R_left: np.ndarray
+    R_right: np.ndarray
     center_left: np.ndarray
     center_right: np.ndarray
-    baseline: float
+    disparity_at_infinity: tuple[float, float]
+    inverse_depth_per_px: tuple[float, float]
     left_disparity: np.ndarray
     right_disparity: np.ndarray
     left_confidence: np.ndarray
@@ -47,7 +52,7 @@ class DisparityMap:
 
     A: (3, 3), b: (3,) float32, as in the module's docstring
     disparity, confidence: (H, W) float32;  disparity_at_infinity: px
-    inverse_depth_per_px: 1 / (focal_px * baseline);  sigma_px: noise at confidence 1
+    inverse_depth_per_px: see PairFrame;  sigma_px: noise at confidence 1
     """
 
     A: np.ndarray
@@ -61,17 +66,15 @@ class DisparityMap:
 
 def maps_of_pair(pair: PairFrame, target: Camera) -> tuple[DisparityMap, DisparityMap]:
     """The left and the right disparity map of a pair with their projections to the target."""
-    per_px = 1.0 / (pair.K_left[0, 0] * pair.baseline)
-    shared = (
-        np.float32(pair.K_left[0, 2] - pair.K_right[0, 2]),
-        np.float32(per_px),
-        np.float32(pair.sigma_px),
+    left = _linear_map(target, pair.K_left, pair.R_left, pair.center_left)
+    right = _linear_map(target, pair.K_right, pair.R_right, pair.center_right)
+    left_units, right_units = (
+        (np.float32(zero), np.float32(per_px), np.float32(pair.sigma_px))
+        for zero, per_px in zip(pair.disparity_at_infinity, pair.inverse_depth_per_px, strict=True)
     )
-    left = _linear_map(target, pair.K_left, pair.R, pair.center_left)
-    right = _linear_map(target, pair.K_right, pair.R, pair.center_right)
     return (
-        DisparityMap(*left, pair.left_disparity, pair.left_confidence, *shared),
-        DisparityMap(*right, pair.right_disparity, pair.right_confidence, *shared),
+        DisparityMap(*left, pair.left_disparity, pair.left_confidence, *left_units),
+        DisparityMap(*right, pair.right_disparity, pair.right_confidence, *right_units),
     )
 
 

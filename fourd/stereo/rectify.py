@@ -63,8 +63,24 @@ class Rectification:
         return float(self.K_left[0, 0])
 
     @property
-    def disparity_at_infinity(self) -> float:
-        return float(self.K_left[0, 2] - self.K_right[0, 2])
+    def R_left(self) -> np.ndarray:
+        return self.R
+
+    @property
+    def R_right(self) -> np.ndarray:
+        return self.R
+
+    @property
+    def disparity_at_infinity(self) -> tuple[float, float]:
+        """Of the left and the right map, px."""
+        both = float(self.K_left[0, 2] - self.K_right[0, 2])
+        return both, both
+
+    @property
+    def inverse_depth_per_px(self) -> tuple[float, float]:
+        """Of the left and the right map: 1 / depth is (disparity - disparity_at_infinity) times this."""
+        both = 1 / (self.focal_px * self.baseline)
+        return both, both
 
     def camera(self, side: str) -> Camera:
         """The ideal pinhole of one rectified image; side is `left` or `right`."""
@@ -131,13 +147,13 @@ class PairRectification:
 def inverse_depth_from_disparity(rectification: Rectification, disparity: np.ndarray) -> np.ndarray:
     """1 / depth (world units, z of the rectified frame) of disparities (...,) px; <= 0 is at infinity."""
     scale = rectification.focal_px * rectification.baseline
-    return (disparity - rectification.disparity_at_infinity) / scale
+    return (disparity - rectification.disparity_at_infinity[0]) / scale
 
 
 def disparity_from_depth(rectification: Rectification, depth: np.ndarray) -> np.ndarray:
     """Disparity (...,) px of depths (...,) > 0, world units, possibly infinite."""
     scale = rectification.focal_px * rectification.baseline
-    return scale / np.asarray(depth) + rectification.disparity_at_infinity
+    return scale / np.asarray(depth) + rectification.disparity_at_infinity[0]
 
 
 def rectifying_rotation(left: Camera, right: Camera) -> np.ndarray:

@@ -41,9 +41,10 @@ def rectify(cameras: dict[str, Camera], left: str, right: str) -> dict:
     K_right = a.K.copy()
     K_right[0, 2] += 1.5
     return {
-        "left": left, "right": right, "K_left": K_left, "K_right": K_right, "R": R,
-        "center_left": a.center, "center_right": b.center,
-        "baseline": float(np.linalg.norm(b.center - a.center)), "sigma_px": 0.25,
+        "left": left, "right": right, "K_left": K_left, "K_right": K_right, "R_left": R, "R_right": R,
+        "center_left": a.center, "center_right": b.center, "sigma_px": 0.25,
+        "disparity_at_infinity": (float(K_left[0, 2] - K_right[0, 2]),) * 2,
+        "inverse_depth_per_px": (float(1 / (K_left[0, 0] * np.linalg.norm(b.center - a.center))),) * 2,
     }  # fmt: skip
 
 
@@ -56,9 +57,9 @@ def pair_from_plane(cameras: dict[str, Camera], left: str, right: str, depth: fl
         K, center = geometry[f"K_{side}"], geometry[f"center_{side}"]
         y, x = np.mgrid[:height, :width].astype(np.float64)
         rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K).T
-        z = (depth - center[2]) / (rays @ geometry["R"])[..., 2]
-        offset = geometry["K_left"][0, 2] - geometry["K_right"][0, 2]
-        maps[f"{side}_disparity"] = (K[0, 0] * geometry["baseline"] / z + offset).astype(np.float32)
+        z = (depth - center[2]) / (rays @ geometry["R_left"])[..., 2]
+        (zero, _), (per_px, _) = geometry["disparity_at_infinity"], geometry["inverse_depth_per_px"]
+        maps[f"{side}_disparity"] = (1 / (z * per_px) + zero).astype(np.float32)
         maps[f"{side}_confidence"] = np.ones((height, width), np.float32)
     return PairFrame(**geometry, **maps)
 
@@ -156,9 +157,10 @@ def write_pair(path: Path, pairs: PairFrame | list[PairFrame], frames, status: s
                 right_disparity=encode_disparity(pair.right_disparity),
                 left_confidence=encode_confidence(pair.left_confidence),
                 right_confidence=encode_confidence(pair.right_confidence),
-                K_left=pair.K_left, K_right=pair.K_right, R_left=pair.R, R_right=pair.R,
+                K_left=pair.K_left, K_right=pair.K_right, R_left=pair.R_left, R_right=pair.R_right,
                 center_left=pair.center_left, center_right=pair.center_right,
-                baseline=np.array(pair.baseline), disparity_range=np.array([-4.0, 20.0]),
+                baseline=np.linalg.norm(pair.center_right - pair.center_left),
+                disparity_range=np.array([-4.0, 20.0]),
             )  # fmt: skip
 
 

@@ -146,7 +146,7 @@ def test_silhouettes_do_not_grow():
         maps[f"{side}_disparity"] = np.full_like(pair.left_disparity, np.nan)
         maps[f"{side}_disparity"][6:12, 8:16] = getattr(near, f"{side}_disparity")[6:12, 8:16]
     one = dataclasses.replace(pair, **maps, right_confidence=np.zeros_like(pair.right_confidence))
-    target = Camera(one.K_left, one.R, -one.R @ one.center_left, SIZE)
+    target = Camera(one.K_left, one.R_left, -one.R_left @ one.center_left, SIZE)
     view = fuse_view(target, [one], make_images(cameras), cameras, OPTIONS)
     expected = np.zeros_like(view.valid["closest"])
     expected[6:12, 8:16] = True
@@ -182,7 +182,7 @@ def test_sigma_grows_with_the_square_of_depth_and_falls_with_confidence():
     cameras = make_cameras(2)
     target = cameras["cam00"]
     pair = pair_from_plane(cameras, "cam00", "cam01", 4.0)
-    rotated = Camera(pair.K_left, pair.R, -pair.R @ pair.center_left, SIZE)
+    rotated = Camera(pair.K_left, pair.R_left, -pair.R_left @ pair.center_left, SIZE)
     sources = make_sources(target, cameras, make_images(cameras))
     backend = CpuBackend(sources, OPTIONS, SIZE, 1, SIZE[1])
     half = dataclasses.replace(
@@ -191,7 +191,7 @@ def test_sigma_grows_with_the_square_of_depth_and_falls_with_confidence():
     backend.layer(0, maps_of_pair(half, rotated), (0, SIZE[1]))
     keys = backend._layers[0]
     sigma = (0xFFFFFFFF - (keys[keys > 0] & 0xFFFFFFFF)).astype(np.uint32).view(np.float32)
-    expected = 0.25 / 0.5 / (pair.K_left[0, 0] * pair.baseline)
+    expected = 0.25 / 0.5 * pair.inverse_depth_per_px[0]
     assert sigma.size
     np.testing.assert_allclose(sigma, expected, rtol=1e-5)
 
@@ -317,7 +317,7 @@ def test_world_scaled_by_powers_of_two_scales_depth_and_no_colour(exponent, seed
             p,
             center_left=p.center_left * scale,
             center_right=p.center_right * scale,
-            baseline=p.baseline * scale,
+            inverse_depth_per_px=tuple(x / scale for x in p.inverse_depth_per_px),
         )
         for p in pairs
     ]

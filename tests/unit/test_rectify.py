@@ -174,7 +174,7 @@ class TestRectifiedPair:
 
     def test_infinite_far_reaches_the_disparity_of_infinity(self):
         rectification = rectified(on_arc(0), on_arc(13), far=np.inf)
-        assert rectification.disparity_range[0] == pytest.approx(rectification.disparity_at_infinity)
+        assert rectification.disparity_range[0] == pytest.approx(rectification.disparity_at_infinity[0])
 
     def test_arrays_round_trip(self):
         rectification = rectified(on_arc(0), on_arc(13))
