@@ -131,11 +131,13 @@ class CameraSource:
     """Where a physical camera's frames come from (scene file, `cameras`).
 
     offset_s: given common time of the first frame, None where it is to be found
+    background: what it filmed from the same place with nobody there, if anything
     """
 
     source: str
     offset_s: float | None
     calibration_name: str
+    background: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,6 +201,7 @@ def load_scene(name: str, folder: Path | str = "config/scenes") -> tuple[Scene, 
             entry["source"],
             (offset_s or 0.0) if clock_is_given else None,
             entry["calibration_name"] or camera,
+            entry["background"],
         )
     hint = document["scale_hint"]
     scene = Scene(
@@ -345,6 +348,11 @@ def check_sources(scene: Scene, made_by_rules: tuple[str, ...]) -> None:
     made_by_rules: beginnings of paths that the workflow itself makes
     """
     named = {f"camera {name}": camera.source for name, camera in scene.cameras.items()}
+    named |= {
+        f"background of camera {name}": camera.background
+        for name, camera in scene.cameras.items()
+        if camera.background
+    }
     named |= {f"calibration file {i + 1}": path for i, path in enumerate(scene.calibration)}
     for what, path in named.items():
         if not path.startswith(made_by_rules) and not Path(path).exists():

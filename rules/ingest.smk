@@ -18,6 +18,30 @@ rule fetch_pose2sim:
         "python -m fourd.fetch pose2sim --output data/pose2sim 2> {log}"
 
 
+rule probe_background:
+    input:
+        source=lambda wildcards: SCENE.cameras[wildcards.cam].background,
+    output:
+        facts="<results>/{scene}/ingest/background/{cam}.json",
+        table="<results>/{scene}/ingest/background/{cam}.csv",
+    log:
+        "<logs>/{scene}/probe_background/{cam}.log",
+    benchmark:
+        "<benchmarks>/{scene}/probe_background/{cam}.tsv"
+    wildcard_constraints:
+        cam="|".join(c for c, s in SCENE.cameras.items() if s.background) or "none",
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        fps=SCENE.fps,
+        options=options("ingest"),
+        version=fourd_config.stage_version("ingest"),
+    shell:
+        "python -m fourd.ingest --camera {wildcards.cam} --source {input.source:q} --fps {params.fps}"
+        " {params.options} --output-json {output.facts} --output-table {output.table} 2> {log}"
+
+
 rule probe_camera:
     input:
         source=lambda wildcards: SCENE.cameras[wildcards.cam].source,
