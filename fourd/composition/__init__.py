@@ -27,6 +27,7 @@ class CompositionOptions:
     crop: int | None = None
     validation_samples: int = 4
     seed: int = 0
+    precision: str = "auto"
     max_minutes: float | None = None
     checkpoint_s: float = 60.0
     cache_mb: int = 1024

@@ -14,7 +14,7 @@ import torch
 from fourd import cli, io
 from fourd.composition import STAGE_VERSION, CompositionOptions, data
 from fourd.composition.checkpoint import Checkpoint, StopRequest, save_torch
-from fourd.composition.model import HEADS
+from fourd.composition.model import HEADS, resolve_precision
 from fourd.composition.train import COLUMNS, Trainer, train
 from fourd.errors import InputError
 from fourd.image import undistort
@@ -96,6 +96,8 @@ def run(
 ) -> None:
     """Train one level, continuing from `checkpoint.pt` beside the model if it is the same work."""
     check_options(options)
+    # Resolved here, so that a checkpoint is continued only in the precision that it was made in.
+    options = dataclasses.replace(options, precision=resolve_precision(options.precision, device))
     factor = data.reduction_factor(level, num_levels)
     facts = {k: v for k, v in dataclasses.asdict(options).items() if k not in NOT_IN_FINGERPRINT}
     facts |= {"level": level, "num_levels": num_levels, "stage": STAGE_VERSION, "torch": torch.__version__}
@@ -110,7 +112,13 @@ def run(
     log.info("%d samples to train on, %d kept apart; reading them", *map(len, split))
     num_cached = samples.fill_cache()
     num_parameters = sum(p.numel() for p in trainer.generator.parameters())
-    log.info("%d samples in memory; %d parameters, on %s", num_cached, num_parameters, device)
+    log.info(
+        "%d samples in memory; %d parameters, on %s in %s",
+        num_cached,
+        num_parameters,
+        device,
+        options.precision,
+    )
     with StopRequest() as stop:
         rows = train(trainer, samples, split, options, save, stop)
     io.write_csv(log_path, COLUMNS, rows)

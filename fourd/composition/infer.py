@@ -21,7 +21,7 @@ from fourd.composition.data import (
     reduction_factor,
     streams_from_images,
 )
-from fourd.composition.model import CompositionNet
+from fourd.composition.model import CompositionNet, resolve_precision
 from fourd.composition.model import paste as paste_streams
 from fourd.errors import InputError
 from fourd.image import uint8_from_float
@@ -56,14 +56,16 @@ def _network(document: Mapping[str, Any], device: str) -> CompositionNet:
     return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 
-def run_network(network: CompositionNet, images: np.ndarray) -> np.ndarray:
+def run_network(network: CompositionNet, images: np.ndarray, precision: str = "auto") -> np.ndarray:
     """(H, W, 3) uint8 composed from test-time inputs.
 
     images: (N, H, W, 4) uint8 RGBA, N > 3; consensus at 0 and static background at 3 are read
+    precision: of `resolve_precision`
     """
     device = next(network.parameters()).device
+    streams = streams_from_images(images, TEST_STREAMS).to(device)
     with torch.inference_mode():
-        output = network(streams_from_images(images, TEST_STREAMS).to(device))
+        output = network(streams, resolve_precision(precision, device.type))
     return _image(output)
 
 

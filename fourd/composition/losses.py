@@ -14,6 +14,7 @@ from fourd.errors import InputError
 def masked_difference(output: Tensor, target: Tensor, valid: Tensor) -> Tensor:
     """(B, 3, H, W) output - target, 0 where there is no target, whatever the target holds there.
 
+    At least float32, because sums over a picture leave the range of half precision.
     Raises InputError if a valid target is NaN or infinite.
     """
     clean = torch.where(valid, target, torch.zeros_like(target))
@@ -22,7 +23,8 @@ def masked_difference(output: Tensor, target: Tensor, valid: Tensor) -> Tensor:
             "expected finite colours in every valid pixel of a target image, got NaN or infinity: "
             "mark such pixels invalid or replace the frame"
         )
-    return torch.where(valid, output, torch.zeros_like(output)) - clean
+    difference = torch.where(valid, output, torch.zeros_like(output)) - clean
+    return difference.to(torch.promote_types(difference.dtype, torch.float32))
 
 
 def reconstruction_loss(output: Tensor, target: Tensor, valid: Tensor) -> Tensor:
@@ -47,9 +49,9 @@ def generator_loss(fake_logits: Tensor) -> Tensor:
     softplus(-x) is -log sigmoid(x) without ever forming a probability, so log 0 cannot occur.
     Source: Goodfellow et al., "Generative Adversarial Nets", section 3.
     """
-    return F.softplus(-fake_logits).mean()
+    return F.softplus(-fake_logits.float()).mean()
 
 
 def discriminator_loss(real_logits: Tensor, fake_logits: Tensor) -> Tensor:
     """-log D(real) - log(1 - D(fake)) from logits, mean over patches (equation 2)."""
-    return F.softplus(-real_logits).mean() + F.softplus(fake_logits).mean()
+    return F.softplus(-real_logits.float()).mean() + F.softplus(fake_logits.float()).mean()

@@ -1,5 +1,6 @@
 """Fits one level's network to a scene: every input camera's own frames are its targets."""
 
+import functools
 import logging
 import time
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,7 @@ from torch import Tensor
 from fourd import metrics
 from fourd.composition import CompositionOptions, data, infer, losses
 from fourd.composition.checkpoint import Checkpoint, Progress, StopRequest
-from fourd.composition.model import CompositionNet, Discriminator
+from fourd.composition.model import CompositionNet, Discriminator, autocast
 from fourd.errors import InputError
 
 log = logging.getLogger("fourd.composition")
@@ -73,7 +74,8 @@ def update(
     if a loss or a gradient is not finite.
     """
     generator, discriminator = trainer.generator, trainer.discriminator
-    output = generator(streams)
+    cast = functools.partial(autocast, streams.device.type, options.precision)
+    output = generator(streams, options.precision)
     terms = {
         "reconstruction": losses.reconstruction_loss(output, target, valid),
         "frequency": losses.frequency_loss(output, target, valid),
@@ -83,11 +85,15 @@ def update(
         return None
     if options.adversarial_weight > 0:
         real, fake = (torch.where(valid, image, torch.zeros_like(image)) for image in (target, output))
-        terms["discriminator"] = losses.discriminator_loss(discriminator(real), discriminator(fake.detach()))
+        with cast():
+            logits = discriminator(real), discriminator(fake.detach())
+        terms["discriminator"] = losses.discriminator_loss(*logits)
         if not descend(trainer.discriminator_optimizer, terms["discriminator"]):
             return None
         discriminator.requires_grad_(False)
-        terms["adversarial"] = losses.generator_loss(discriminator(fake))
+        with cast():
+            logit = discriminator(fake)
+        terms["adversarial"] = losses.generator_loss(logit)
         discriminator.requires_grad_(True)
         loss = loss + options.adversarial_weight * terms["adversarial"]
     if not descend(trainer.generator_optimizer, loss):
@@ -126,7 +132,7 @@ def train(
     started = time.monotonic() - counters["elapsed_s"]
     if not counters["rows"] and counters["step"] == 0:
         # What the untrained network gives: without it nobody could tell what training added.
-        counters["rows"].append(_log_row(trainer, samples, apart, 0))
+        counters["rows"].append(_log_row(trainer, samples, apart, 0, options.precision))
     while counters["step"] < total and not _is_over(options.max_minutes, started):
         step = counters["step"]
         epoch, position = divmod(step, len(training))
@@ -150,7 +156,7 @@ def train(
             progress.report(step + 1, epoch, options.epochs, terms)
 
         if counters["step"] % len(training) == 0:
-            counters["rows"].append(_log_row(trainer, samples, apart, epoch + 1))
+            counters["rows"].append(_log_row(trainer, samples, apart, epoch + 1, options.precision))
             counters["sums"] = {}
             save(trainer)
         elif stop.signal_number is not None or save.is_due(options.checkpoint_s):
@@ -160,8 +166,10 @@ def train(
             raise SystemExit(128 + stop.signal_number)
     save(trainer)
     unfinished = counters["step"] % len(training) != 0
-    last = [_log_row(trainer, samples, apart, counters["step"] // len(training) + 1)] if unfinished else []
-    return counters["rows"] + last
+    if not unfinished:
+        return counters["rows"]
+    epoch = counters["step"] // len(training) + 1
+    return [*counters["rows"], _log_row(trainer, samples, apart, epoch, options.precision)]
 
 
 def _is_over(max_minutes: float | None, started: float) -> bool:
@@ -189,25 +197,25 @@ def _psnr(output: Tensor, target: Tensor, valid: Tensor) -> float:
 
 
 def _log_row(
-    trainer: Trainer, samples: data.SampleSet, apart: Sequence[data.SampleId], epoch: int
+    trainer: Trainer, samples: data.SampleSet, apart: Sequence[data.SampleId], epoch: int, precision: str
 ) -> dict[str, Any]:
     """A row of train.csv: means over the epoch, and quality at test-time inputs on samples kept apart."""
     counters = trainer.counters
     row = {name: total / count for name, (total, count) in counters["sums"].items()}
     row |= {"epoch": epoch, "step": counters["step"], "seconds": round(counters["elapsed_s"], 1)}
-    row |= {"skipped_steps": counters["skipped"]} | validate(trainer.generator, samples, apart)
+    row |= {"skipped_steps": counters["skipped"]} | validate(trainer.generator, samples, apart, precision)
     return {name: row.get(name, "") for name in COLUMNS}
 
 
 def validate(
-    network: CompositionNet, samples: data.SampleSet, ids: Sequence[data.SampleId]
+    network: CompositionNet, samples: data.SampleSet, ids: Sequence[data.SampleId], precision: str
 ) -> dict[str, float]:
     """Mean PSNR, dB, of the network at test-time inputs and of the plain paste; empty without samples."""
     rows = []
     for sample in ids:
         images = samples.images(sample)
         truth, region = images[data.TARGET, ..., :3], images[data.TARGET, ..., 3] > 0
-        pair = (infer.run_network(network, images), infer.paste_images(images))
+        pair = (infer.run_network(network, images, precision), infer.paste_images(images))
         if region.any():
             rows.append([metrics.psnr(image, truth, region) for image in pair])
     if not rows:

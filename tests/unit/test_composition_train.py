@@ -17,6 +17,7 @@ from fourd.composition import CompositionOptions, data
 from fourd.composition.__main__ import Sources, main, parse, read_training_views, run
 from fourd.composition.checkpoint import Checkpoint, StopRequest, read_torch
 from fourd.composition.infer import compose_frame, load_models, paste
+from fourd.composition.model import PRECISIONS, resolve_precision
 from fourd.composition.train import Trainer, train, update
 from fourd.errors import InputError
 from fourd.sfm import SceneCameras, write_cameras
@@ -128,16 +129,43 @@ def one_sample(seed=0, side=16):
     return data.streams_from_images(images, data.TEST_STREAMS), target, valid
 
 
+@pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("head", ["blend", "direct"])
-def test_one_batch_is_overfitted(head):
+def test_one_batch_is_overfitted(head, precision):
     torch.set_num_threads(1)
-    options = dataclasses.replace(TINY, num_filters=(6,), depth=2, head=head, learning_rate=2e-3)
+    options = dataclasses.replace(
+        TINY, num_filters=(6,), depth=2, head=head, learning_rate=2e-3, precision=precision
+    )
     trainer, sample, history = Trainer(0, options, "cpu"), one_sample(), []
     for _ in range(150):
         result = update(trainer, *sample, options)
         assert result is not None
         history.append(result[0]["reconstruction"])
     assert min(history[-10:]) < history[0] / 10
+
+
+def test_half_precision_follows_full_precision():
+    """Losses and picture of the first steps differ by the rounding of the convolutions only."""
+    rows, images = [], []
+    for precision in PRECISIONS:
+        options = dataclasses.replace(TINY, num_filters=(6,), precision=precision)
+        trainer, sample = Trainer(0, options, "cpu"), one_sample()
+        for _ in range(3):
+            terms, output = update(trainer, *sample, options)
+            assert output.dtype == torch.float32
+        assert all(p.dtype == torch.float32 for p in trainer.generator.parameters())
+        rows.append(terms)
+        images.append(output)
+    assert rows[0] == pytest.approx(rows[1], rel=0.02)
+    assert float((images[0] - images[1]).abs().max()) < 2 / 255
+    assert not torch.equal(*images)
+
+
+def test_automatic_precision_is_one_the_device_has():
+    assert resolve_precision("auto", "cpu") in PRECISIONS
+    assert resolve_precision("bfloat16", "cpu") == "bfloat16"
+    with pytest.raises(InputError, match="float32 or bfloat16, got 'float8'"):
+        resolve_precision("float8", "cpu")
 
 
 def test_update_refuses_a_step_that_is_not_finite():
@@ -200,9 +228,11 @@ def interrupted_training(sources, folder, options, num_interruptions):
     return trainer.generator.state_dict(), trainer.counters
 
 
-def test_training_interrupted_at_every_step_equals_uninterrupted(sources, tmp_path):
-    whole, counters = interrupted_training(sources, tmp_path / "a", TINY, 1)
-    parts, counters_of_parts = interrupted_training(sources, tmp_path / "b", TINY, 9)
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_training_interrupted_at_every_step_equals_uninterrupted(sources, tmp_path, precision):
+    options = dataclasses.replace(TINY, precision=precision)
+    whole, counters = interrupted_training(sources, tmp_path / "a", options, 1)
+    parts, counters_of_parts = interrupted_training(sources, tmp_path / "b", options, 9)
     assert counters["step"] == counters_of_parts["step"] == 12
     assert are_equal(whole, parts)
     timeless = [[{**row, "seconds": 0} for row in c["rows"]] for c in (counters, counters_of_parts)]
