@@ -14,6 +14,7 @@ import torch
 from fourd import cli, io
 from fourd.composition import STAGE_VERSION, CompositionOptions, data
 from fourd.composition.checkpoint import Checkpoint, StopRequest, save_torch
+from fourd.composition.forecast import check_memory
 from fourd.composition.model import HEADS, resolve_precision
 from fourd.composition.train import COLUMNS, Trainer, train
 from fourd.errors import InputError
@@ -111,6 +112,9 @@ def run(
     save.restore(trainer, options.epochs * len(split[0]))
     log.info("%d samples to train on, %d kept apart; reading them", *map(len, split))
     num_cached = samples.fill_cache()
+    height, width = samples.images(samples.ids[0]).shape[1:3]
+    size = (min(height, options.crop or height), min(width, options.crop or width))
+    log.info(check_memory(trainer.network_arguments, size, options.precision, device))
     num_parameters = sum(p.numel() for p in trainer.generator.parameters())
     log.info(
         "%d samples in memory; %d parameters, on %s in %s",

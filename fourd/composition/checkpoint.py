@@ -16,6 +16,8 @@ from fourd.errors import InputError
 log = logging.getLogger("fourd.composition")
 
 PROGRESS_S = 5.0
+# The first of these steps, slower than the rest, is not counted.
+PROBE_STEPS = 20
 
 
 class Resumable(Protocol):
@@ -104,10 +106,16 @@ class Progress:
 
     def __init__(self, total: int, first: int) -> None:
         self._total, self._first = total, first
-        self._started = self._reported = time.monotonic()
+        self._started = self._reported = self._warm = time.monotonic()
 
     def report(self, done: int, epoch: int, epochs: int, terms: Mapping[str, float]) -> None:
         now = time.monotonic()
+        if done - self._first == 1:
+            self._warm = now
+        if done - self._first == 1 + PROBE_STEPS:
+            step_s = (now - self._warm) / PROBE_STEPS
+            left_min = step_s * (self._total - done) / 60
+            log.info("forecast: %d steps of %.3f s, %.1f minutes", self._total - done, step_s, left_min)
         if now - self._reported < PROGRESS_S and done < self._total:
             return
         self._reported = now

@@ -141,7 +141,7 @@ class CompositionNet(nn.Module):
             encoded = [stream(padded[:, i]) for i, stream in enumerate(self.streams)]
             features = self.output[:-1](self.unet(torch.cat(encoded, dim=1)))
         # Always in full precision: 8 bits of mantissa are coarser than a grey level.
-        decoded = crop(self.output[-1](features.float()), size)
+        decoded = crop(self.output[-1](features.to(streams.dtype)), size)
         return decoded if self.head == "direct" else blend(streams, decoded)
 
 
