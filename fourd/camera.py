@@ -147,12 +147,27 @@ def check_camera(camera: Camera, where: str) -> None:
             f"{where}: K must have positive focal lengths and last row 0 0 1, got {camera.K.tolist()}: "
             "fix the calibration"
         )
+    miss_px = _border_miss_px(camera)
+    if not miss_px < 1:
+        raise InputError(
+            f"{where}: the lens must give every pixel a ray, got distortion {camera.distortion.tolist()}, "
+            f"which folds back inside the picture (its border is missed by {miss_px:.3g} px): calibrate with "
+            "fewer coefficients, or crop the frames"
+        )
     error = float(np.abs(camera.R @ camera.R.T - np.eye(3)).max())
     if error > 1e-4 or np.linalg.det(camera.R) < 0:
         raise InputError(
             f"{where}: R must be a rotation (R R^T = 1 within 1e-4, determinant +1), got error {error:.2g} "
             f"and determinant {np.linalg.det(camera.R):.3g}: fix the calibration"
         )
+
+
+def _border_miss_px(camera: Camera) -> float:
+    """By how much pixels of the border, where a lens bends most, miss themselves through `rays` and back."""
+    across, down = np.meshgrid(*(np.linspace(0, n - 1, 9) for n in camera.size))
+    pixels = np.stack([across, down], axis=-1)
+    rim = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])
+    return float(np.abs(camera.pixels_from_normalized(camera.rays(rim)[:, :2]) - rim).max())
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 Positions are float64 in and out. A camera position keeps about 16 digits, so a source world whose
 origin lies D scene sizes away gives normalised positions that are exact to about 1e-16 D: 1e7 is
-harmless, 1e12 shifts cameras by 1e-4 of the scene. Nothing else depends on the source's units.
+harmless, from 1e10 on it is refused. Nothing else depends on the source's units.
 """
 
 import dataclasses
@@ -11,10 +11,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fourd.camera import Camera
+from fourd.errors import InputError
 from fourd.geometry import convergence_point, nearest_rotation
+
+# Centres are kept to this part of the world unit, far below what any calibration knows: what comes after
+# must not depend on the last bits of the source's digits, and matching takes every bit for a picture.
+CENTER_STEP = 2.0**-20
 
 # Axes whose directions spread less than this meet too far away to name a point.
 MIN_CONVERGENCE_DEG = 2.0
+
+# Largest rounding of a source position, in world units, that still leaves the scene recognisable.
+MAX_ROUNDING = 1e-6
 
 # Weight of the mean image-up axis against level right-hand axes: a tie-break, not an opinion.
 MEAN_UP_WEIGHT = 1e-2
@@ -44,6 +52,7 @@ class Similarity:
         """The same camera in the normalised world, its R made exactly orthonormal."""
         # solve, not R.T: the centre is the null vector of [R | t] even when R is rounded.
         center = self.world_from_source(np.linalg.solve(camera.R, -camera.t))
+        center = np.round(center / CENTER_STEP) * CENTER_STEP
         R = nearest_rotation(camera.R)
         return dataclasses.replace(camera, R=R, t=-R @ center)
 
@@ -54,6 +63,7 @@ def estimate_similarity(cameras: Sequence[Camera]) -> Similarity:
     The origin is the convergence point of the optical axes when they are not near-parallel and it
     lies in front of every camera, and the scale the median distance to it; otherwise the origin is
     the mean centre and the scale the RMS distance from it, or 1 if all centres coincide.
+    Raises InputError if the positions' digits do not tell the cameras apart well enough.
     """
     centers = np.stack([np.linalg.solve(c.R, -c.t) for c in cameras])
     middle = centers.mean(axis=0)
@@ -65,9 +75,18 @@ def estimate_similarity(cameras: Sequence[Camera]) -> Similarity:
     # In front by a tenth: a point beside a camera is no place that it films.
     is_in_front = bool((depths > 0.1 * scale).all())
     if is_in_front and scale > floor and _axes_spread_deg(cameras) > MIN_CONVERGENCE_DEG:
-        return Similarity(point, scale, True)
-    spread = float(np.sqrt(((centers - middle) ** 2).sum(axis=1).mean()))
-    return Similarity(middle, spread if spread > floor else 1.0, False)
+        similarity = Similarity(point, scale, True)
+    else:
+        spread = float(np.sqrt(((centers - middle) ** 2).sum(axis=1).mean()))
+        similarity = Similarity(middle, spread if spread > floor else 1.0, False)
+    rounding = float(np.finfo(np.float64).eps * np.abs(centers).max() / similarity.scale)
+    if rounding > MAX_ROUNDING:
+        raise InputError(
+            f"the calibration's origin lies so far away that positions are rounded to {rounding:.1g} of the "
+            f"scene's size, more than {MAX_ROUNDING:g}: expected cameras near the origin of their world; "
+            "subtract a common offset from their positions"
+        )
+    return similarity
 
 
 def _axes_spread_deg(cameras: Sequence[Camera]) -> float:

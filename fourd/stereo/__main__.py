@@ -19,7 +19,10 @@ from fourd.stereo.files import (
     read_rectification,
     write_rectification,
 )
-from fourd.stereo.rectify import STATUS_OK, PairRectification, RectifyOptions, rectify_tracks
+from fourd.stereo.guard import describe_measures
+from fourd.stereo.rectification import STATUS_OK, SWEEP, PairRectification
+from fourd.stereo.rectify import RectifyOptions, rectify_tracks
+from fourd.stereo.sweep import SWEEP_SIGMA_PX, sweep_pair
 
 _log = logging.getLogger(__name__)
 
@@ -42,18 +45,14 @@ def run_rectify(cameras_path: Path, left: str, right: str, options: RectifyOptio
     left_out = io.read_json(cameras_path).get("left_out", {})
     absent = [f"camera {name} is left out: {left_out[name]}" for name in (left, right) if name in left_out]
     if absent:
-        pair = PairRectification(left, right, "; ".join(absent), (0, 0), float("nan"), 0)
+        pair = PairRectification(left, right, "; ".join(absent), 0)
     else:
         pair = rectify_tracks(*read_tracks(cameras_path, left, right), options)
     write_rectification(output, pair)
-    if pair.status == STATUS_OK:
-        low, high = np.array([r.disparity_range for r in pair.frames]).T
-        _log.info(
-            "%s-%s: %.1f degrees, %dx%d px, disparities %.0f to %.0f px",
-            left, right, pair.angle_deg, *pair.size, low.min(), high.max(),
-        )  # fmt: skip
-    else:
-        _log.info("%s-%s refused: %s", left, right, pair.status)
+    verdict = f"refused: {pair.status}" if pair.kind is None else pair.kind
+    if pair.obstacle:
+        verdict += f" ({pair.obstacle})"
+    _log.info("%s-%s %s; %s", left, right, verdict, describe_measures(pair.measures) or "nothing measured")
 
 
 def run_disparity(
@@ -67,7 +66,8 @@ def run_disparity(
     """Match the frames of a pair and write them one by one; a refused pair keeps its reason."""
     matcher = make_matcher(options)
     pair = read_rectification(rectification_path)
-    with io.ArchiveWriter(output, disparity_meta(pair, options.sigma_px)) as writer:
+    sigma_px = SWEEP_SIGMA_PX if pair.kind == SWEEP else options.sigma_px
+    with io.ArchiveWriter(output, disparity_meta(pair, sigma_px)) as writer:
         if pair.status != STATUS_OK:
             _log.info("%s-%s not matched: %s", pair.left, pair.right, pair.status)
             return
@@ -75,13 +75,13 @@ def run_disparity(
         density = []
         with open_camera(film_paths[0]) as left, open_camera(film_paths[1]) as right:
             for frame in frames:
-                disparity = match_pair(
-                    pair.at(frame),
-                    (tracks[0].at(frame), tracks[1].at(frame)),
-                    (left.read(frame), right.read(frame)),
-                    matcher,
-                    options,
-                )
+                rectification = pair.at(frame)
+                views = tracks[0].at(frame), tracks[1].at(frame)
+                images = left.read(frame), right.read(frame)
+                if rectification.kind == SWEEP:
+                    disparity = sweep_pair(rectification, views, images, options)
+                else:
+                    disparity = match_pair(rectification, views, images, matcher, options)
                 add_disparity_frame(writer, frame, disparity)
                 density.append(
                     (

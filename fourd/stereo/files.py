@@ -21,9 +21,15 @@ def write_rectification(path: Path | str, pair: PairRectification) -> None:
         "left": pair.left,
         "right": pair.right,
         "status": pair.status,
+        "kind": pair.kind,
+        "obstacle": pair.obstacle,
         "size": list(pair.size),
+        "size_right": list(pair.size_right),
         "angle_deg": pair.angle_deg if np.isfinite(pair.angle_deg) else None,
         "frames": pair.num_frames,
+        "guard": {
+            name: [v if np.isfinite(v) else None for v in pair.measures[name]] for name in pair.measures
+        },
     }
     with ArchiveWriter(path, meta) as writer:
         for frame, rectification in enumerate(pair.frames):
@@ -35,13 +41,16 @@ def read_rectification(path: Path | str) -> PairRectification:
     archive = Archive(path)
     meta = archive.meta
     try:
-        width, height = meta["size"]
+        (width, height), (width_right, height_right) = meta["size"], meta["size_right"]
         frames = tuple(
-            Rectification.from_arrays(archive.frame(frame), (width, height)) for frame in archive.frames()
+            Rectification.from_arrays(
+                archive.frame(frame), (width, height), (width_right, height_right), meta["obstacle"] or ""
+            )
+            for frame in archive.frames()
         )
-        angle_deg = float("nan") if meta["angle_deg"] is None else float(meta["angle_deg"])
+        measures = {name: (_from_json(low), _from_json(high)) for name, (low, high) in meta["guard"].items()}
         pair = PairRectification(
-            meta["left"], meta["right"], meta["status"], (width, height), angle_deg, meta["frames"], frames
+            meta["left"], meta["right"], meta["status"], meta["frames"], frames, measures
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
@@ -53,9 +62,20 @@ def read_rectification(path: Path | str) -> PairRectification:
     return pair
 
 
+def _from_json(value: float | None) -> float:
+    """JSON has no infinity; what was not measured is left out altogether."""
+    return float("inf") if value is None else float(value)
+
+
 def disparity_meta(pair: PairRectification, sigma_px: float) -> dict[str, Any]:
     """The meta of a disparity file."""
-    return {"left": pair.left, "right": pair.right, "status": pair.status, "sigma_px": sigma_px}
+    return {
+        "left": pair.left,
+        "right": pair.right,
+        "status": pair.status,
+        "kind": pair.kind,
+        "sigma_px": sigma_px,
+    }
 
 
 def add_disparity_frame(writer: ArchiveWriter, frame: int, disparity: PairDisparity) -> None:
@@ -87,9 +107,9 @@ def read_disparity_frame(archive: Archive, frame: int) -> PairDisparity:
             f"expected frame {frame} in {archive.path}, got frames {archive.frames()}: ask for the chunk "
             "that holds it"
         ) from None
-    height, width = arrays["left_disparity"].shape
+    size, size_right = (arrays[f"{side}_disparity"].shape[::-1] for side in ("left", "right"))
     return PairDisparity(
-        Rectification.from_arrays(arrays, (width, height)),
+        Rectification.from_arrays(arrays, size, size_right),
         decode_disparity(arrays["left_disparity"]),
         decode_disparity(arrays["right_disparity"]),
         decode_confidence(arrays["left_confidence"]),

@@ -1,159 +1,68 @@
-"""Planar rectification of a pair of cameras.
+"""How a pair of cameras is brought into one frame for matching: rectified to one plane, or swept.
 
 The rectified frame has its origin at a camera's centre, x along the baseline from left to right,
 z as near as possible to the mean of the optical axes and y = z x x. Both images share rotation,
 focal length and rows; each has its own cx, so that it frames what its own camera sees. Rows,
-columns and disparities are those of the common visible volume (`fourd.stereo.volume`).
+columns and disparities are those of the common visible volume (`fourd.stereo.volume`). Where a
+plane would be stretched too far, above all with an epipole in or near an image, each side keeps
+its own axes (`fourd.stereo.sweep_frame`).
 
 Source: A. Fusiello, E. Trucco, A. Verri, "A compact algorithm for rectification of stereo pairs",
 Machine Vision and Applications 12, 2000.
 """
 
 import dataclasses
-from collections.abc import Mapping
 
 import numpy as np
 
 from fourd.camera import Camera, CameraTrack
 from fourd.errors import InputError
+from fourd.stereo.guard import (
+    NOMINAL_SIGMA_PX,
+    Guard,
+    Refusal,
+    extremes,
+    measure_poses,
+    planar_obstacle,
+    refuse_by_angle,
+    refuse_by_field_of_view,
+    refuse_by_overlap,
+    refuse_by_poses,
+)
+from fourd.stereo.rectification import (
+    STATUS_OK,
+    SWEEP,
+    PairRectification,
+    Rectification,
+    with_one_size,
+)
+from fourd.stereo.sweep_frame import measure_sweep, sweep_sides, swept_rectification
 from fourd.stereo.volume import (
     RectifyOptions,
-    Refusal,
     angle_at_scene_deg,
     common_volume,
     field_of_view,
-    refuse_by_field_of_view,
-    refuse_by_poses,
-    refuse_by_volume,
+    image_overlap,
+    off_axis_deg,
+    worst_stretch,
 )
-
-STATUS_OK = "ok"
-MAX_DISPARITY_PX = 1000
-"""Files hold disparities in 16 bits at 1/32 px, which ends at 1023 px."""
 
 _OUTSIDE = -1e4
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Rectification:
-    """Two images whose rows correspond, at one instant.
-
-    K_left, K_right: (3, 3) px, equal but for cx;  R: (3, 3) rectified_from_world of both
-    center_left, center_right: (3,) world units;  size: (width, height) of both images, px
-    disparity_range: (lowest, highest) x_left - x_right of the common visible volume, px
-    angle_deg: angle at the scene's centre between the rays to both cameras
-    """
-
-    K_left: np.ndarray
-    K_right: np.ndarray
-    R: np.ndarray
-    center_left: np.ndarray
-    center_right: np.ndarray
-    size: tuple[int, int]
-    disparity_range: tuple[float, float]
-    angle_deg: float = float("nan")
-
-    @property
-    def baseline(self) -> float:
-        """Distance between the centres, world units."""
-        return float(np.linalg.norm(self.center_right - self.center_left))
-
-    @property
-    def focal_px(self) -> float:
-        return float(self.K_left[0, 0])
-
-    @property
-    def R_left(self) -> np.ndarray:
-        return self.R
-
-    @property
-    def R_right(self) -> np.ndarray:
-        return self.R
-
-    @property
-    def disparity_at_infinity(self) -> tuple[float, float]:
-        """Of the left and the right map, px."""
-        both = float(self.K_left[0, 2] - self.K_right[0, 2])
-        return both, both
-
-    @property
-    def inverse_depth_per_px(self) -> tuple[float, float]:
-        """Of the left and the right map: 1 / depth is (disparity - disparity_at_infinity) times this."""
-        both = 1 / (self.focal_px * self.baseline)
-        return both, both
-
-    def camera(self, side: str) -> Camera:
-        """The ideal pinhole of one rectified image; side is `left` or `right`."""
-        K, center = (self.K_left, self.center_left) if side == "left" else (self.K_right, self.center_right)
-        return Camera(K, self.R, -self.R @ center, self.size)
-
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """The arrays of docs/formats.md, rectification; the size is kept in meta."""
-        return {
-            "K_left": self.K_left,
-            "K_right": self.K_right,
-            "R_left": self.R,
-            "R_right": self.R,
-            "center_left": self.center_left,
-            "center_right": self.center_right,
-            "baseline": np.array(self.baseline),
-            "disparity_range": np.array(self.disparity_range),
-        }
-
-    @staticmethod
-    def from_arrays(arrays: Mapping[str, np.ndarray], size: tuple[int, int]) -> "Rectification":
-        """Inverse of `to_arrays`; the angle, which is kept in meta per pair, stays NaN."""
-        low, high = arrays["disparity_range"]
-        return Rectification(
-            arrays["K_left"],
-            arrays["K_right"],
-            arrays["R_left"],
-            arrays["center_left"],
-            arrays["center_right"],
-            size,
-            (float(low), float(high)),
-        )
+def inverse_depth_from_disparity(
+    rectification: Rectification, disparity: np.ndarray, side: str = "left"
+) -> np.ndarray:
+    """1 / depth (world units, z of that side) of disparities (...,) px; <= 0 is at infinity or beyond."""
+    i = 0 if side == "left" else 1
+    return (disparity - rectification.disparity_at_infinity[i]) * rectification.inverse_depth_per_px[i]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PairRectification:
-    """A pair over the clip: one rectification if both cameras stand still, else one per frame.
-
-    status: `ok`, or the reason why the pair is refused; then `frames` is empty
-    size: (width, height) of all rectified images;  angle_deg: the largest of all frames
-    num_frames: how many frames were judged
-    """
-
-    left: str
-    right: str
-    status: str
-    size: tuple[int, int]
-    angle_deg: float
-    num_frames: int
-    frames: tuple[Rectification, ...] = ()
-
-    def at(self, frame: int) -> Rectification:
-        """The rectification at a frame of the common clock. Raises InputError past the end."""
-        if len(self.frames) == 1:
-            return self.frames[0]
-        if not 0 <= frame < len(self.frames):
-            raise InputError(
-                f"pair {self.left}-{self.right}: expected a frame in 0..{len(self.frames) - 1}, got "
-                f"{frame}: rectify the pair again with cameras that cover the clip"
-            )
-        return self.frames[frame]
-
-
-def inverse_depth_from_disparity(rectification: Rectification, disparity: np.ndarray) -> np.ndarray:
-    """1 / depth (world units, z of the rectified frame) of disparities (...,) px; <= 0 is at infinity."""
-    scale = rectification.focal_px * rectification.baseline
-    return (disparity - rectification.disparity_at_infinity[0]) / scale
-
-
-def disparity_from_depth(rectification: Rectification, depth: np.ndarray) -> np.ndarray:
-    """Disparity (...,) px of depths (...,) > 0, world units, possibly infinite."""
-    scale = rectification.focal_px * rectification.baseline
-    return scale / np.asarray(depth) + rectification.disparity_at_infinity[0]
+def disparity_from_depth(rectification: Rectification, depth: np.ndarray, side: str = "left") -> np.ndarray:
+    """Disparity (...,) px of one side's depths (...,) > 0, world units, possibly infinite."""
+    i = 0 if side == "left" else 1
+    inverse_depth = 1 / np.asarray(depth)
+    return inverse_depth / rectification.inverse_depth_per_px[i] + rectification.disparity_at_infinity[i]
 
 
 def rectifying_rotation(left: Camera, right: Camera) -> np.ndarray:
@@ -190,39 +99,105 @@ def rectify_pair(
     range_left: tuple[float, float],
     range_right: tuple[float, float],
     options: RectifyOptions,
+    kind: str | None = None,
 ) -> Rectification | Refusal:
-    """Rectify one pair at one instant, or say why it should not be matched.
+    """Bring one pair into one frame at one instant, or say why it should not be matched.
 
     range_left, range_right: near > 0 and far (may be infinite) depth of what each camera films,
-    z in its own frame, world units
-    Returns a Rectification whose images hold exactly the rows and columns that can correspond
+    z in its own frame, world units;  kind: `sweep` if another frame of the pair has to be swept
+    Returns a planar Rectification, whose images hold exactly the rows and columns that can
+    correspond; a swept one where a plane would be stretched too far; or a Refusal
     """
-    refusal = refuse_by_poses(left, right, min(range_left[0], range_right[0]), options)
-    if refusal is not None:
-        return refusal
-    R = rectifying_rotation(left, right)
-    refusal = refuse_by_field_of_view(left, right, R)
-    if refusal is not None:
-        return refusal
+    guard = measure_poses(left, right)
+    reason = refuse_by_poses(guard, min(range_left[0], range_right[0]), options)
+    if reason is not None:
+        return Refusal(reason, guard)
     margin = 1 + options.depth_margin
     (near_left, far_left), (near_right, far_right) = range_left, range_right
     range_left, range_right = (
         (near_left / margin, far_left * margin),
         (near_right / margin, far_right * margin),
     )
+    if kind == SWEEP:
+        obstacle: str | None = "another frame of the pair has to be swept"
+        planar = None
+    else:
+        planar, guard = _rectify_planar(left, right, range_left, range_right, guard, options)
+        reason = refuse_by_angle(guard, options)
+        if reason is not None:
+            return Refusal(reason, guard)
+        obstacle = planar_obstacle(guard, options)
+    if obstacle is not None:
+        return _sweep_or_refuse(left, right, range_left, range_right, guard, obstacle, options)
+    reason = refuse_by_overlap(guard, options)
+    if reason is not None:
+        return Refusal(reason, guard)
+    # Without an obstacle and with some overlap there is a plane.
+    assert planar is not None
+    return dataclasses.replace(planar, guard=guard)
+
+
+def _rectify_planar(
+    left: Camera,
+    right: Camera,
+    range_left: tuple[float, float],
+    range_right: tuple[float, float],
+    guard: Guard,
+    options: RectifyOptions,
+) -> tuple[Rectification | None, Guard]:
+    """The planar rectification, None if there is none, and the guard with all that it tells."""
+    if planar_obstacle(guard, options) is not None:
+        return None, guard
+    R = rectifying_rotation(left, right)
+    guard = dataclasses.replace(guard, off_axis_deg=max(off_axis_deg(c, R) for c in (left, right)))
+    if planar_obstacle(guard, options) is not None:
+        return None, guard
     vertices = common_volume(left, right, R, range_left, range_right)
     if len(vertices) == 0:
-        return Refusal("no overlap: no point lies in both fields of view within both depth ranges")
-    angle = angle_at_scene_deg(left, right, R, vertices, range_left, range_right)
+        return None, dataclasses.replace(guard, overlap=0.0)
     focal_px = common_focal_px(left, right, R) * options.scale
-    refusal = refuse_by_volume(left, right, R, vertices, focal_px, angle, options)
-    return _frame_volume(left, right, R, vertices, focal_px, angle) if refusal is None else refusal
+    planar = _frame_volume(left, right, R, vertices, focal_px)
+    angle = angle_at_scene_deg(left, right, R, vertices, range_left, range_right)
+    return planar, dataclasses.replace(
+        guard,
+        angle_deg=angle,
+        stretch=worst_stretch(left, right, R, vertices, focal_px / options.scale),
+        overlap=min(image_overlap(left, R, vertices, 0.0), image_overlap(right, R, vertices, 1.0)),
+        disparity_low=planar.disparity_range[0],
+        disparity_high=planar.disparity_range[1],
+        depth_error=float(NOMINAL_SIGMA_PX / (focal_px * np.radians(angle))),
+    )
+
+
+def _sweep_or_refuse(
+    left: Camera,
+    right: Camera,
+    range_left: tuple[float, float],
+    range_right: tuple[float, float],
+    guard: Guard,
+    obstacle: str,
+    options: RectifyOptions,
+) -> Rectification | Refusal:
+    """A swept pair, or both reasons: why not one plane, and why not many.
+
+    range_left, range_right: widened depths;  obstacle: of `planar_obstacle`
+    """
+    guard = dataclasses.replace(guard, off_axis_deg=max(off_axis_deg(c, c.R) for c in (left, right)))
+    reason = refuse_by_field_of_view(guard)
+    if reason is None:
+        sides = sweep_sides(left, right, range_left, range_right, options.scale)
+        guard = measure_sweep(guard, *sides)
+        reason = refuse_by_angle(guard, options) or refuse_by_overlap(guard, options)
+        if reason is None:
+            return swept_rectification(*sides, guard, obstacle)
+    return Refusal(f"{obstacle}. Nor can the pair be swept by planes: {reason}", guard)
 
 
 def rectify_tracks(left: CameraTrack, right: CameraTrack, options: RectifyOptions) -> PairRectification:
-    """Rectify a pair over the clip; all frames get one image size, the largest any frame needs.
+    """Bring a pair into one frame over the clip.
 
-    One refused frame refuses the pair: a pair that comes and goes would make depth flicker.
+    All frames of a planar pair get one image size, the largest any of them needs. All frames are of
+    one kind, and one refused frame refuses the pair: a pair that comes and goes would make depth flicker.
     Raises InputError if a depth range is not 0 < near < far or the tracks differ in length.
     """
     for track in (left, right):
@@ -232,21 +207,25 @@ def rectify_tracks(left: CameraTrack, right: CameraTrack, options: RectifyOption
                 f"{track.far:g} in the cameras file: give the depth range of the scene"
             )
     num_frames = max(len(left.cameras), len(right.cameras))
-    results = [
-        rectify_pair(left.at(frame), right.at(frame), (left.near, left.far), (right.near, right.far), options)
-        for frame in range(num_frames)
-    ]
+    ranges = (left.near, left.far), (right.near, right.far)
+
+    def rectify_all(kind: str | None) -> list[Rectification | Refusal]:
+        return [
+            rectify_pair(left.at(frame), right.at(frame), *ranges, options, kind)
+            for frame in range(num_frames)
+        ]
+
+    results = rectify_all(None)
+    if len({r.kind for r in results if isinstance(r, Rectification)}) > 1:
+        results = rectify_all(SWEEP)
+    measures = extremes([r.guard for r in results if r.guard])
     refused = [(frame, r) for frame, r in enumerate(results) if isinstance(r, Refusal)]
-    angles = [r.angle_deg for r in results if np.isfinite(r.angle_deg)]
-    angle = max(angles, default=float("nan"))
     if refused:
         frame, first = refused[0]
         where = "" if num_frames == 1 else f" (frame {frame}; {len(refused)} of {num_frames} frames refused)"
-        return PairRectification(left.name, right.name, first.reason + where, (0, 0), angle, num_frames)
-    kept = [r for r in results if isinstance(r, Rectification)]
-    size = (max(r.size[0] for r in kept), max(r.size[1] for r in kept))
-    frames = tuple(dataclasses.replace(r, size=size) for r in kept)
-    return PairRectification(left.name, right.name, STATUS_OK, size, angle, num_frames, frames)
+        return PairRectification(left.name, right.name, first.reason + where, num_frames, measures=measures)
+    frames = with_one_size([r for r in results if isinstance(r, Rectification)])
+    return PairRectification(left.name, right.name, STATUS_OK, num_frames, frames, measures)
 
 
 def sampling_maps(
@@ -258,11 +237,11 @@ def sampling_maps(
     Returns map_x, map_y (H, W) float32 px of the source, for cv2.remap, and valid (H, W) bool:
     the place is inside the source image, so that interpolation invents nothing
     """
-    K = rectification.K_left if side == "left" else rectification.K_right
-    width, height = rectification.size
+    ideal = rectification.camera(side)
+    K, (width, height) = ideal.K, ideal.size
     x = (np.arange(width) - K[0, 2]) / K[0, 0]
     y = (np.arange(height)[:, None] - K[1, 2]) / K[1, 1]
-    in_camera = camera.R @ rectification.R.T
+    in_camera = camera.R @ ideal.R.T
     if not camera.is_distorted:
         in_camera = camera.K @ in_camera
     u, v, z = (row[0] * x + (row[1] * y + row[2]) for row in in_camera)
@@ -289,8 +268,8 @@ def sampling_maps(
 
 
 def _frame_volume(
-    left: Camera, right: Camera, R: np.ndarray, vertices: np.ndarray, focal_px: float, angle: float
-) -> Rectification | Refusal:
+    left: Camera, right: Camera, R: np.ndarray, vertices: np.ndarray, focal_px: float
+) -> Rectification:
     """Intrinsics, size and disparity range that just hold the common volume."""
     x_left, y, disparity = vertices.T
     x_right = x_left - disparity
@@ -302,11 +281,5 @@ def _frame_volume(
     extent = focal_px * np.array([max(np.ptp(x_left), np.ptp(x_right)), np.ptp(y)])
     width, height = (int(n) for n in np.ceil(extent) + 1)
     disparity = disparity * focal_px + cx_left - cx_right
-    low, high = float(disparity.min()), float(disparity.max())
-    if max(-low, high) > MAX_DISPARITY_PX:
-        return Refusal(
-            f"disparities would reach {max(-low, high):.0f} px, more than {MAX_DISPARITY_PX}: lower "
-            "rectify scale",
-            angle,
-        )
-    return Rectification(K_left, K_right, R, left.center, right.center, (width, height), (low, high), angle)
+    disparity_range = float(disparity.min()), float(disparity.max())
+    return Rectification(K_left, K_right, R, left.center, right.center, (width, height), disparity_range)

@@ -13,13 +13,12 @@ import numpy as np
 from fourd.camera import Camera
 from fourd.geometry import angle_deg, convergence_point
 
-_MAX_OFF_AXIS_DEG = 80.0
 _BORDER_SAMPLES = 33
 
 
 @dataclasses.dataclass(frozen=True)
 class RectifyOptions:
-    """Limits between which a pair is matched, and the resolution at which."""
+    """Limits between which a pair is rectified to one plane, swept by planes or refused, and resolution."""
 
     max_angle_deg: float = 50.0
     min_angle_deg: float = 1.0
@@ -29,14 +28,6 @@ class RectifyOptions:
     min_overlap: float = 0.2
     depth_margin: float = 0.05
     scale: float = 1.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Refusal:
-    """Why a pair is not matched."""
-
-    reason: str
-    angle_deg: float = float("nan")
 
 
 def field_of_view(camera: Camera) -> np.ndarray:
@@ -83,98 +74,17 @@ def common_volume(
     half_spaces = np.stack(planes)
     half_spaces /= np.linalg.norm(half_spaces, axis=1, keepdims=True)
     triples = half_spaces[list(itertools.combinations(range(len(planes)), 3))]
-    triples = triples[np.abs(np.linalg.det(triples[:, :, :3])) > 1e-12]
+    # An exactly singular triple makes LAPACK divide by zero on the way to its determinant of 0.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        triples = triples[np.abs(np.linalg.det(triples[:, :, :3])) > 1e-12]
     vertices = np.linalg.solve(triples[:, :, :3], -triples[:, :, 3:])[..., 0]
     scale = 1 + np.abs(vertices).max(axis=1, initial=0)
     inside = (vertices @ half_spaces[:, :3].T + half_spaces[:, 3]).min(axis=1, initial=np.inf)
     return vertices[inside >= -1e-9 * scale]
 
 
-def refuse_by_field_of_view(left: Camera, right: Camera, R: np.ndarray) -> Refusal | None:
-    """Refuse images that reach too far around for one plane.  R: rectified_from_world."""
-    off_axis = max(_off_axis_deg(camera, R) for camera in (left, right))
-    if off_axis <= _MAX_OFF_AXIS_DEG:
-        return None
-    return Refusal(
-        f"the fields of view reach {off_axis:.0f} degrees away from the axis of the rectified images, "
-        f"past {_MAX_OFF_AXIS_DEG:.0f}: one plane cannot hold both"
-    )
-
-
-def refuse_by_poses(left: Camera, right: Camera, near: float, options: RectifyOptions) -> Refusal | None:
-    """Refuse what poses and focal lengths alone forbid.  near: smallest depth, world units."""
-    baseline = right.center - left.center
-    if np.linalg.norm(baseline) <= 1e-9 * near:
-        return Refusal("the cameras share one centre, so depth leaves no trace: nothing to match")
-    for side, camera in (("left", left), ("right", right)):
-        direction = camera.R @ baseline
-        low, high = field_of_view(camera)
-        margin = options.epipole_margin * (high - low)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            epipole = direction[:2] / direction[2]
-        if np.all((epipole >= low - margin) & (epipole <= high + margin)):
-            return Refusal(
-                f"the epipole lies in or near the {side} image (the cameras stand almost one behind the "
-                "other or face each other): planar rectification would stretch it without bound"
-            )
-    apart = float(angle_deg(left.forward, right.forward))
-    if apart > 2 * _MAX_OFF_AXIS_DEG:
-        return Refusal(f"the optical axes are {apart:.0f} degrees apart: no plane faces both images")
-    ratio = max(left.focal_px / right.focal_px, right.focal_px / left.focal_px)
-    if ratio > options.max_focal_ratio:
-        return Refusal(
-            f"the focal lengths differ by a factor {ratio:.1f} in px, more than {options.max_focal_ratio:g}: "
-            "the images do not show the same detail"
-        )
-    return None
-
-
-def refuse_by_volume(
-    left: Camera,
-    right: Camera,
-    R: np.ndarray,
-    vertices: np.ndarray,
-    focal_px: float,
-    angle: float,
-    options: RectifyOptions,
-) -> Refusal | None:
-    """Refuse by what is seen in common: too wide, too narrow, too stretched or too little.
-
-    vertices: of `common_volume`;  focal_px: of the rectified images
-    angle: at the scene's centre between the rays to both cameras, degrees
-    """
-    if angle > options.max_angle_deg:
-        return Refusal(
-            f"the cameras see the scene {angle:.0f} degrees apart, more than {options.max_angle_deg:g}: "
-            "too few pixels would match",
-            angle,
-        )
-    if angle < options.min_angle_deg:
-        return Refusal(
-            f"the cameras see the scene {angle:.2g} degrees apart, less than {options.min_angle_deg:g}: an "
-            f"error of 1 px would move the scene's centre by {100 / (focal_px * np.radians(angle)):.0f} % "
-            "of its depth",
-            angle,
-        )
-    stretch = _stretch(left, right, R, vertices, focal_px / options.scale)
-    if stretch > options.max_stretch:
-        return Refusal(
-            f"rectification would stretch or shrink parts of an image {stretch:.1f} times, more than "
-            f"{options.max_stretch:g}",
-            angle,
-        )
-    overlap = min(_overlap(left, R, vertices, 0.0), _overlap(right, R, vertices, 1.0))
-    if overlap < options.min_overlap:
-        return Refusal(
-            f"only {100 * overlap:.0f} % of an image can be seen by the other camera, less than "
-            f"{100 * options.min_overlap:g} %",
-            angle,
-        )
-    return None
-
-
-def _off_axis_deg(camera: Camera, R: np.ndarray) -> float:
-    """Largest angle between the corners of an image and the rectified axis."""
+def off_axis_deg(camera: Camera, R: np.ndarray) -> float:
+    """Largest angle between the corners of an image and the rectified axis.  R: rectified_from_world."""
     corners = np.array([[x, y, 1.0] for x, y in itertools.product(*field_of_view(camera).T)])
     return float(angle_deg(corners @ camera.R, R[2]).max())
 
@@ -203,8 +113,11 @@ def angle_at_scene_deg(
     return float(angle_deg(center - left.center, center - right.center))
 
 
-def _stretch(left: Camera, right: Camera, R: np.ndarray, vertices: np.ndarray, focal_px: float) -> float:
-    """Worst linear magnification, or its inverse, from an image to its rectified form."""
+def worst_stretch(left: Camera, right: Camera, R: np.ndarray, vertices: np.ndarray, focal_px: float) -> float:
+    """Worst linear magnification, or its inverse, from an image to its rectified form.
+
+    vertices: of `common_volume`;  focal_px: of the rectified images
+    """
     worst = 1.0
     for camera, shift in ((left, 0.0), (right, 1.0)):
         x = vertices[:, 0] - shift * vertices[:, 2]
@@ -216,8 +129,11 @@ def _stretch(left: Camera, right: Camera, R: np.ndarray, vertices: np.ndarray, f
     return worst
 
 
-def _overlap(camera: Camera, R: np.ndarray, vertices: np.ndarray, shift: float) -> float:
-    """Share of an image inside the box of rows and columns that the other image can match."""
+def image_overlap(camera: Camera, R: np.ndarray, vertices: np.ndarray, shift: float) -> float:
+    """Share of an image inside the box of rows and columns that the other image can match.
+
+    vertices: of `common_volume`;  shift: 0 for the left image, 1 for the right one
+    """
     across, down = (np.linspace(0, n - 1, 24) for n in camera.size)
     pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
     rays = camera.rays(pixels) @ (R @ camera.R.T).T

@@ -1,5 +1,4 @@
 import dataclasses
-import re
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from fourd import config
 from fourd.camera import Camera, CameraTrack
 from fourd.errors import InputError
 from fourd.geometry import look_at
+from fourd.stereo.guard import Refusal
 from fourd.stereo.rectify import (
     Rectification,
     disparity_from_depth,
@@ -20,7 +20,7 @@ from fourd.stereo.rectify import (
     rectifying_rotation,
     sampling_maps,
 )
-from fourd.stereo.volume import RectifyOptions, Refusal, common_volume
+from fourd.stereo.volume import RectifyOptions, common_volume
 
 LENS = np.array([-0.12, 0.03, 0.001, -0.002, 0.0])
 RANGE = (2.0, 20.0)
@@ -135,7 +135,7 @@ class TestRectifiedPair:
         result = rectify_pair(left, right, RANGE, RANGE, RectifyOptions())
         if isinstance(result, Refusal):
             assert len(result.reason) > 20
-        else:
+        elif result.kind == "planar":
             # A pixel near a lens' fold is bent more between samples of the map.
             check_alignment(left, right, result, 0.02 if bent else 0.01)
 
@@ -181,9 +181,9 @@ class TestRectifiedPair:
         arrays = rectification.to_arrays()
         assert set(arrays) == {
             "K_left", "K_right", "R_left", "R_right", "center_left", "center_right", "baseline",
-            "disparity_range",
+            "disparity_range", "disparity_at_infinity", "inverse_depth_per_px",
         }  # fmt: skip
-        again = Rectification.from_arrays(arrays, rectification.size)
+        again = Rectification.from_arrays(arrays, rectification.size, rectification.size)
         for key, array in again.to_arrays().items():
             np.testing.assert_array_equal(array, arrays[key])
 
@@ -208,7 +208,6 @@ class TestRectifiedPair:
 
     def test_stretch_is_that_of_the_maps(self):
         left, right = on_arc(0), on_arc(30)
-        reason = refused(left, right, RectifyOptions(max_stretch=1.01))
         rectification = rectified(left, right)
         worst = 1.0
         for side, source in (("left", left), ("right", right)):
@@ -216,7 +215,7 @@ class TestRectifiedPair:
             (xy, xx), (yy, yx) = np.gradient(map_x), np.gradient(map_y)
             linear = np.sqrt(np.abs(xx * yy - xy * yx))[valid]
             worst = max(worst, linear.max(), 1 / linear.min())
-        assert float(re.findall(r"([\d.]+) times", reason)[0]) == pytest.approx(worst, rel=0.05)
+        assert rectification.guard.stretch == pytest.approx(worst, rel=0.05)
 
 
 class TestCommonVolume:
@@ -241,12 +240,9 @@ class TestRefusals:
             camera_at([0, 0, 0], [0, 1, 0]), camera_at([0, 0, 0], [0.1, 1, 0])
         )
 
-    def test_epipole_in_the_image(self):
-        reason = refused(camera_at([0, -5, 1], [0, 0, 1]), camera_at([0.1, -4, 1], [0, 0, 1]))
-        assert "epipole" in reason
-
     def test_cameras_that_face_each_other(self):
-        assert "epipole" in refused(camera_at([0, -5, 1], [0, 0, 1]), camera_at([0, 5, 1], [0, 0, 1]))
+        reason = refused(camera_at([0, -5, 1], [0, 0, 1]), camera_at([0, 5, 1], [0, 0, 1]), far=9)
+        assert "epipole" in reason and "swept" in reason and "degrees apart, more than 50" in reason
 
     def test_ninety_degrees_apart(self):
         assert "89 degrees apart, more than 50" in refused(
@@ -271,9 +267,6 @@ class TestRefusals:
     def test_little_overlap(self):
         left, right = camera_at([0, 0, 0], [-0.4, 1, 0]), camera_at([1.5, 0, 0], [1.9, 1, 0])
         assert "can be seen by the other camera" in refused(left, right, far=20)
-
-    def test_stretch(self):
-        assert "stretch" in refused(on_arc(0), on_arc(30), RectifyOptions(max_stretch=1.05))
 
     def test_very_wide_lens(self):
         left, right = (camera_at([x, 0, 0], [x, 1, 0], focal_px=25.0) for x in (0, 1))
