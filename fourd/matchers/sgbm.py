@@ -22,6 +22,10 @@ _MODES = {
 }
 _FIXED_POINT = 16
 """StereoSGBM returns disparities in units of 1/16 px."""
+_PARABOLIC = np.arange(-_FIXED_POINT // 2, _FIXED_POINT // 2 + 1, dtype=np.float32) / _FIXED_POINT
+_EQUIANGULAR = 2 * _PARABOLIC / (1 + 2 * np.abs(_PARABOLIC))
+"""Costs are absolute differences, whose minimum is a V: where StereoSGBM fits a parabola through three
+of them, two lines meet at the true place, and one follows from the other."""
 _MULTIPLE = 16
 """StereoSGBM takes numbers of disparities that are multiples of 16."""
 
@@ -91,5 +95,9 @@ class SgbmMatcher:
         )
         fixed = sgbm.compute(padded_left, padded_right)[:, before : before + left.shape[1]]
         found = (fixed >= lowest * _FIXED_POINT) & (fixed <= highest * _FIXED_POINT)
-        disparity = np.where(found, fixed.astype(np.float32) / _FIXED_POINT, np.float32(np.nan))
+        half = _FIXED_POINT // 2
+        whole = (fixed.astype(np.int32) + half) // _FIXED_POINT
+        offset = (fixed - whole * _FIXED_POINT + half).astype(np.intp)
+        disparity = whole.astype(np.float32) + _EQUIANGULAR[offset]
+        disparity[~found] = np.nan
         return Match(disparity, found.astype(np.float32))

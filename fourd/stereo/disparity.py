@@ -9,21 +9,12 @@ from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.matchers import Match, Matcher
 from fourd.matchers.sgbm import SgbmMatcher, SgbmOptions
+from fourd.matchers.subpixel import refine
 from fourd.stereo.check import StereoOptions, check_direction, left_right_difference
+from fourd.stereo.normalise import match_tones
 from fourd.stereo.rectify import Rectification, sampling_maps
 
-MATCHERS = {
-    "sgbm": lambda options: SgbmMatcher(
-        SgbmOptions(
-            options.sgbm_mode,
-            options.sgbm_block_size_px,
-            options.sgbm_penalty_small,
-            options.sgbm_penalty_large,
-            options.sgbm_prefilter_cap,
-            options.sgbm_uniqueness_percent,
-        )
-    )
-}
+MATCHERS = ("sgbm", "census", "psmnet", "network")
 _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
 
 
@@ -46,12 +37,34 @@ class PairDisparity:
 
 
 def make_matcher(options: StereoOptions) -> Matcher:
-    """The matcher that the options name. Raises InputError if there is none of that name."""
-    if options.matcher not in MATCHERS:
-        raise InputError(
-            f"expected a matcher out of {', '.join(MATCHERS)}, got {options.matcher!r}: set stereo matcher"
+    """The matcher that the options name. Raises InputError if there is none, or it lacks its weights."""
+    # Only the matcher at work is imported: torch alone takes 2 seconds.
+    if options.matcher == "sgbm":
+        return SgbmMatcher(
+            SgbmOptions(
+                options.sgbm_mode,
+                options.sgbm_block_size_px,
+                options.sgbm_penalty_small,
+                options.sgbm_penalty_large,
+                options.sgbm_prefilter_cap,
+                options.sgbm_uniqueness_percent,
+            )
         )
-    return MATCHERS[options.matcher](options)
+    if options.matcher == "census":
+        from fourd.matchers.census import CensusMatcher
+
+        return CensusMatcher()
+    if options.matcher == "psmnet":
+        from fourd.matchers.psmnet import PsmnetMatcher
+
+        return PsmnetMatcher(options.network_file)
+    if options.matcher == "network":
+        from fourd.matchers.network import NetworkMatcher
+
+        return NetworkMatcher(options.network_file)
+    raise InputError(
+        f"expected a matcher out of {', '.join(MATCHERS)}, got {options.matcher!r}: set stereo matcher"
+    )
 
 
 def match_right(
@@ -107,8 +120,13 @@ def match_pair(
     """
     left, left_valid = rectify_image(images[0], rectification, cameras[0], "left", options.interpolation)
     right, right_valid = rectify_image(images[1], rectification, cameras[1], "right", options.interpolation)
+    if options.match_tones:
+        right = match_tones(right, right_valid, left, left_valid)
     from_left = matcher.match(left, right, rectification.disparity_range)
     from_right = match_right(matcher, left, right, rectification.disparity_range)
+    if options.is_refined:
+        from_left = Match(refine(from_left.disparity, left, right, direction=-1), from_left.confidence)
+        from_right = Match(refine(from_right.disparity, right, left, direction=1), from_right.confidence)
     to_right = left_right_difference(
         from_left.disparity, left_valid, from_right.disparity, right_valid, direction=-1
     )
