@@ -305,7 +305,7 @@ def fit_chunk_frames(config: Mapping[str, Any], scene: Scene) -> int:
     def estimate_jobs(frames: int) -> int:
         chunks = -(-scene.num_frames // frames)
         views = len(scene.cameras) + len(config["trajectories"])
-        return len(scene.pairs) * (chunks + 2) + views * (3 * chunks + 2) + 2 * len(scene.cameras)
+        return len(scene.pairs) * (chunks + 2) + chunks + views * (3 * chunks + 2) + 2 * len(scene.cameras)
 
     if estimate_jobs(chunk_frames) > config["max_jobs"]:
         fits = chunk_frames

@@ -128,6 +128,32 @@ def disparities_of_view(wildcards):
     )
 
 
+def silhouettes_of_view(wildcards):
+    """Silhouettes of the cameras that may serve a view: its own would tell what is to be predicted."""
+    return expand(
+        "<results>/{scene}/silhouettes/{cam}/{chunk}.npz",
+        scene=wildcards.scene,
+        cam=[cam for cam in SCENE.inputs if cam != wildcards.view],
+        chunk=scene_chunks(wildcards.view, wildcards.chunk),
+    )
+
+
+def empty_scene_of(wildcards):
+    """The facts of a camera's film of the empty scene, where there is one."""
+    has_one = SCENE.cameras[wildcards.cam].background
+    return (
+        [f"<results>/{wildcards.scene}/ingest/background/{wildcards.cam}.json"] if has_one else []
+    )
+
+
+def empty_scene_flags(wildcards):
+    if not SCENE.cameras[wildcards.cam].background:
+        return ""
+    return flags_from_mapping(
+        {"background_film": f"{RESULTS}/ingest/background/{wildcards.cam}.json"}
+    )
+
+
 def estimates_of_view(wildcards):
     """Films need the consensus only; physical cameras are trained on and scored with all four."""
     if wildcards.view in TRAJECTORIES:

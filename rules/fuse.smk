@@ -9,6 +9,7 @@ rule fuse_training:
         cameras="<results>/{scene}/sfm/cameras.json",
         films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=expand("<results>/{{scene}}/disparity/{pair}/{{chunk}}.npz", pair=SCENE.pairs),
+        silhouettes=expand("<results>/{{scene}}/silhouettes/{cam}/{{chunk}}.npz", cam=SCENE.inputs),
     output:
         [
             intermediate("foreground", f"<results>/{{scene}}/foreground/{cam}/{{chunk}}.npz")
@@ -24,12 +25,12 @@ rule fuse_training:
     threads: 1
     params:
         frames=lambda wildcards: frames_of_view(SCENE.inputs[0], wildcards.chunk),
-        options=options("fuse"),
+        options=" ".join([options("fuse"), options("hull")]),
         version=fourd_config.stage_version("fuse"),
     shell:
         "python -m fourd.fuse foreground --view-file {input.view} --cameras {input.cameras}"
         " --frames {params.frames} --disparity {input.disparity} --films {input.films}"
-        " {params.options} --output {output} 2> {log}"
+        " --silhouettes {input.silhouettes} {params.options} --output {output} 2> {log}"
 
 
 rule fuse_foreground:
@@ -38,6 +39,7 @@ rule fuse_foreground:
         cameras="<results>/{scene}/sfm/cameras.json",
         films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=disparities_of_view,
+        silhouettes=silhouettes_of_view,
     output:
         intermediate("foreground", "<results>/{scene}/foreground/{view}/{chunk}.npz"),
     log:
@@ -53,9 +55,9 @@ rule fuse_foreground:
     params:
         frames=lambda wildcards: frames_of_view(wildcards.view, wildcards.chunk),
         estimates=estimates_of_view,
-        options=options("fuse"),
+        options=" ".join([options("fuse"), options("hull")]),
         version=fourd_config.stage_version("fuse"),
     shell:
         "python -m fourd.fuse foreground --view-file {input.view} --cameras {input.cameras}"
         " --frames {params.frames} --disparity {input.disparity} --films {input.films}"
-        " --estimates {params.estimates} {params.options} --output {output} 2> {log}"
+        " --silhouettes {input.silhouettes} --estimates {params.estimates} {params.options} --output {output} 2> {log}"

@@ -15,12 +15,16 @@ from typing import Any
 
 from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
 from fourd.errors import InputError
-from fourd.fuse.files import DisparityFiles, Pictures, Progress
+from fourd.fuse.files import DisparityFiles, Pictures, Progress, Silhouettes
+from fourd.fuse.hull import HullOptions
 from fourd.fuse.options import ESTIMATES, FuseOptions
 from fourd.fuse.view import FusedView, choose_device, fuse_view
 from fourd.io import ArchiveWriter
 from fourd.sfm.cameras import read_cameras
 from fourd.views import read_view
+
+# Least depth that the hull is looked for at, as a share of the nearest that any camera films.
+CLOSER = 0.25
 
 log = logging.getLogger(__name__)
 
@@ -31,8 +35,10 @@ def run(
     frames: Sequence[int],
     disparity_paths: Sequence[Path],
     films: Sequence[str],
+    silhouette_paths: Sequence[Path],
     estimates: Sequence[str],
     options: FuseOptions,
+    hull_options: HullOptions,
     device: str,
     output: Path,
 ) -> None:
@@ -46,6 +52,9 @@ def run(
     scene = read_cameras(cameras_path)
     disparities = DisparityFiles(disparity_paths, view.name)
     pictures = Pictures(films, scene, view.name)
+    silhouettes = Silhouettes(silhouette_paths, view.name)
+    # A virtual camera may come closer to the scene than any other; a hull has no far end of its own.
+    depth_range = min(track.near for track in scene.tracks.values()) * CLOSER, float("inf")
     meta: dict[str, Any] = {
         "view": view.name,
         "cameras": list(pictures.names),
@@ -67,13 +76,17 @@ def run(
             if loaded is None or entry.scene_frame != scene_frame:
                 scene_frame = entry.scene_frame
                 loaded = disparities.at(scene_frame, options.memory_mb), *pictures.at(scene_frame)
-            fused = fuse_view(entry.camera, *loaded, options, estimates, device=device)
+            fused = fuse_view(
+                entry.camera, *loaded, options, estimates, device=device,
+                silhouettes=silhouettes.at(entry.scene_frame), depth_range=depth_range, hull_options=hull_options,
+            )  # fmt: skip
             _write_frame(writer, frame, fused)
             meta["frame_status"][f"{frame:06d}"] = fused.status
             cover = {name: f"{100 * valid.mean():.0f} %" for name, valid in fused.valid.items()}
             progress.step(f"{fused.status}, {fused.num_points} points, covers {cover}")
     disparities.close()
     pictures.close()
+    silhouettes.close()
 
 
 def _write_frame(writer: ArchiveWriter, frame: int, fused: FusedView) -> None:
@@ -85,6 +98,7 @@ def _write_frame(writer: ArchiveWriter, frame: int, fused: FusedView) -> None:
         support=fused.support,
         num_cameras=fused.num_cameras,
         source=fused.source,
+        depth_source=fused.depth_source,
     )
 
 
@@ -98,10 +112,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     command.add_argument("--frames", type=int, nargs="+", required=True, help="output frames of the views")
     command.add_argument("--disparity", type=Path, nargs="*", default=[], help="files of all pairs")
     command.add_argument("--films", nargs="*", default=[], help="frames/cameras/{cam}.npz, or CAMERA=PATH")
+    command.add_argument(
+        "--silhouettes", type=Path, nargs="*", default=[], help="silhouettes/{cam}/{chunk}.npz"
+    )
     command.add_argument("--estimates", nargs="+", choices=ESTIMATES, default=list(ESTIMATES))
     command.add_argument("--device", default="auto", help="auto, cpu or a torch device")
     command.add_argument("--output", type=Path, nargs="+", required=True, help="one file per view file")
     add_options(command, FuseOptions)
+    add_options(command, HullOptions)
     args = parser.parse_args(argv)
     if len(args.view_file) != len(args.output):
         raise InputError(
@@ -118,8 +136,10 @@ def main(argv: Sequence[str] | None = None) -> None:
             args.frames,
             args.disparity,
             args.films,
+            args.silhouettes,
             estimates,
             options_from_args(FuseOptions, args),
+            options_from_args(HullOptions, args),
             choose_device(args.device),
             output,
         )

@@ -92,7 +92,7 @@ def _place_row(p, v, us, ts, px, py, cost):
         facing = q0 * d0 + q1 * d1 + q2 * d2 > _ZERO
         usable = inside & facing & (q2 > _ZERO) & (r2 <= far)
         px[i], py[i] = min(max(at_x, _ZERO), right), min(max(at_y, _ZERO), bottom)
-        cost[i] = (sine_squared + _MIN_SINE) * (coarser * coarser) if usable else _NEVER
+        cost[i] = np.sqrt(sine_squared + _MIN_SINE) * coarser if usable else _NEVER
 
 
 @njit(cache=True, nogil=True)

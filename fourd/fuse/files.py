@@ -166,6 +166,44 @@ class Pictures:
             reader.close()
 
 
+class Silhouettes:
+    """Silhouettes of the input cameras by scene frame.
+
+    status: camera -> why it has none
+    """
+
+    def __init__(self, paths: Sequence[Path], exclude: str) -> None:
+        """paths: silhouettes/{cam}/{chunk}.npz;  exclude: the target camera's name.
+
+        Raises InputError for a file that holds no silhouettes.
+        """
+        self.status: dict[str, str] = {}
+        self._archives: list[tuple[str, Archive, frozenset[int]]] = []
+        for path in paths:
+            archive = Archive(path)
+            try:
+                name, status = archive.meta["camera"], archive.meta["status"]
+            except KeyError as error:
+                raise InputError(
+                    f"expected silhouettes at {path}, its meta lacks {error}: delete it and run again"
+                ) from None
+            if status != "ok" or name == exclude:
+                self.status[name] = status
+                archive.close()
+            else:
+                self._archives.append((name, archive, frozenset(archive.frames())))
+
+    def at(self, frame: int) -> dict[str, np.ndarray]:
+        """name -> (H, W) uint8 mask, 255 moving, 0 background, 128 unknown, at a scene frame."""
+        return {
+            name: archive[f"{frame:06d}/mask"] for name, archive, frames in self._archives if frame in frames
+        }
+
+    def close(self) -> None:
+        for _, archive, _ in self._archives:
+            archive.close()
+
+
 class Progress:
     """A log line per finished item with the time that is left."""
 

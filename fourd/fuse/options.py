@@ -6,6 +6,8 @@ import numpy as np
 
 ESTIMATES = ("consensus", "closest", "median", "farthest")
 MAX_CAMERAS = 64
+# What gave the depth of a pixel.
+NO_DEPTH, STEREO, HULL = 0, 1, 2
 
 # Half the footprint of one source pixel on the target, px; larger patches are cut to it. It bounds
 # the work per point when the target magnifies much.
@@ -46,7 +48,7 @@ class FuseOptions:
     min_cameras: int = 2
     max_front: float = 1.0
     footprint: float = 0.6
-    num_sources: int = 3
+    num_sources: int = 4
     memory_mb: int = 512
 
 

@@ -270,7 +270,7 @@ def see(sources: Sources, c: int, u: Scalar, v: Scalar, t: Scalar) -> tuple[Scal
     squares = (q[0] * q[0] + q[1] * q[1] + q[2] * q[2]) * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     sine_squared = (cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2]) / squares
     coarser = max(focal_ratio * q[2], F(1))
-    return px, py, (sine_squared + F(MIN_SINE_SQUARED)) * (coarser * coarser)
+    return px, py, np.sqrt(sine_squared + F(MIN_SINE_SQUARED)) * coarser
 
 
 def blend(sources: Sources, found: list[tuple[Scalar, int, Scalar, Scalar]], num_sources: int) -> np.ndarray:

@@ -349,7 +349,7 @@ def _see(
     squares = (q[0] * q[0] + q[1] * q[1] + q[2] * q[2]) * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     sine_squared = (c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) / squares
     coarser = (focal_ratio * q[2]).clamp(min=1)
-    cost = (sine_squared + _round(MIN_SINE_SQUARED)) * (coarser * coarser)
+    cost = torch.sqrt(sine_squared + _round(MIN_SINE_SQUARED)) * coarser
     inside = (px >= -0.5) & (px <= right + 0.5) & (py >= -0.5) & (py <= bottom + 0.5) & (r2 <= far)
     px, py = px.clamp(0, right), py.clamp(0, bottom)
     facing = q[0] * d[0] + q[1] * d[1] + q[2] * d[2] > 0

@@ -12,8 +12,19 @@ from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.fuse.cpu import CpuBackend
 from fourd.fuse.geometry import PairFrame, make_sources, maps_of_pair
-from fourd.fuse.options import ESTIMATES, MAX_CAMERAS, FuseOptions, FusionRules
+from fourd.fuse.hull import HullDepth, HullOptions, carve_view
+from fourd.fuse.options import (
+    ESTIMATES,
+    HULL,
+    MAX_CAMERAS,
+    NO_DEPTH,
+    STEREO,
+    FuseOptions,
+    FusionRules,
+)
 from fourd.fuse.reference import ReferenceBackend
+
+_HULL_OPTIONS = HullOptions()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -23,6 +34,7 @@ class FusedView:
     rgb, valid, depths: estimate -> (H, W, 3) uint8, (H, W) bool, (H, W) float32 z, NaN = blank
     support: (H, W) uint8 pairs that agree on the consensus;  num_cameras: (H, W) uint8
     source: (H, W) uint8 index into `cameras` of the heaviest source of the first estimate, 255 = none
+    depth_source: (H, W) uint8 what gave the depth of the first estimate, `NO_DEPTH`, `STEREO` or `HULL`
     cameras: names;  num_pairs: pairs used;  min_pairs: what a consensus needed
     num_points: valid disparities projected, once per tile that they may touch
     status: `ok` or why everything is blank
@@ -34,6 +46,7 @@ class FusedView:
     support: np.ndarray
     num_cameras: np.ndarray
     source: np.ndarray
+    depth_source: np.ndarray
     cameras: tuple[str, ...]
     num_pairs: int
     min_pairs: int
@@ -51,6 +64,9 @@ def fuse_view(
     *,
     farthest_min_pairs: int = 1,
     device: str = "cpu",
+    silhouettes: Mapping[str, np.ndarray] | None = None,
+    depth_range: tuple[float, float] = (0.0, float("inf")),
+    hull_options: HullOptions = _HULL_OPTIONS,
 ) -> FusedView:
     """Fuse all pairs at one instant in a target camera.
 
@@ -60,15 +76,19 @@ def fuse_view(
     estimates: any of `ESTIMATES`;  farthest_min_pairs: the farthest sample that this many pairs
         support, or the plain farthest where there is none; 1 is the paper's
     device: `cpu` (compiled), a torch device such as `cuda` or `torch:cpu`, or `reference` (slow)
+    silhouettes: name -> (H, W) uint8 of that camera's picture, 255 moving, 0 background, 128 unknown: where
+        the consensus is blank, the visual hull gives its depth, with no pair in `support`
+    depth_range: nearest and farthest z in the target where a hull is looked for
     With fewer pairs than `options.min_pairs` that number is asked for instead. No pair gives blanks
     and a status.
     Raises InputError for a distorted target, more than 64 cameras, or a pair without images.
     """
     _check(target, images, cameras, estimates)
     wanted = [e for e in ESTIMATES if e in estimates]
+    min_pairs = max(1, min(options.min_pairs, len(pairs)))
     rules = FusionRules(
         options.tolerance,
-        max(1, min(options.min_pairs, len(pairs))),
+        min_pairs,
         options.min_cameras,
         options.max_front,
         farthest_min_pairs,
@@ -84,19 +104,15 @@ def fuse_view(
         for rows in tiles:
             num_points += _fuse_tile(backend, target, pairs, list(images), rules, rows, result)
     status = "ok" if num_points else ("no valid disparity" if pairs else "no usable pair")
+    if silhouettes and "consensus" in wanted:
+        blank = ~result.valid["consensus"]
+        hull = carve_view(target, cameras, silhouettes, images, blank, depth_range, hull_options)
+        if _add_hull(hull, blank, target, images, cameras, options, device, result):
+            status = "ok"
     return FusedView(
-        rgb=result.rgb,
-        valid=result.valid,
-        depths=result.depths,
-        support=result.counts[0],
-        num_cameras=result.counts[1],
-        source=result.source,
-        cameras=tuple(images),
-        num_pairs=len(pairs),
-        min_pairs=rules.min_pairs,
-        num_points=num_points,
-        status=status,
-    )
+        result.rgb, result.valid, result.depths, result.counts[0], result.counts[1], result.source,
+        result.depth_source, tuple(images), len(pairs), min_pairs, num_points, status,
+    )  # fmt: skip
 
 
 class _Arrays:
@@ -108,6 +124,7 @@ class _Arrays:
         self.depths = {e: np.full((height, width), np.nan, np.float32) for e in wanted}
         self.counts = np.zeros((2, height, width), np.uint8)
         self.source = np.full((height, width), 255, np.uint8)
+        self.depth_source = np.full((height, width), NO_DEPTH, np.uint8)
 
 
 def _fuse_tile(
@@ -139,7 +156,39 @@ def _fuse_tile(
         np.not_equal(source[e], 255, out=result.valid[estimate][part])
     if result.rgb:
         result.source[part] = source[ESTIMATES.index(next(iter(result.rgb)))]
+        result.depth_source[part][result.source[part] != 255] = STEREO
     return num_points
+
+
+def _add_hull(
+    hull: HullDepth,
+    blank: np.ndarray,
+    target: Camera,
+    images: Mapping[str, np.ndarray],
+    cameras: Mapping[str, Camera],
+    options: FuseOptions,
+    device: str,
+    result: _Arrays,
+) -> bool:
+    """Depth and colour of the hull at blank pixels (H, W) bool, which any camera may have seen.
+
+    Returns whether any pixel got one.
+    """
+    width, height = target.size
+    chosen = np.full((4, height, width), -1, np.float32)
+    held = blank & np.isfinite(hull.depth)
+    chosen[0][held] = 1 / hull.depth[held]
+    masks = np.zeros(chosen.shape, np.uint64)
+    masks[0] = np.uint64((1 << len(images)) - 1)
+    sources = make_sources(target, dict(cameras), dict(images))
+    rgb, source = _backend_class(device)(sources, options, target.size, 1, height).colours(chosen, masks, 0)
+    found = source[0] != 255
+    result.rgb["consensus"][found] = rgb[0][found]
+    result.depths["consensus"][found] = hull.depth[found]
+    result.source[found] = source[0][found]
+    result.depth_source[found] = HULL
+    result.valid["consensus"] |= found
+    return bool(found.any())
 
 
 def _tiles(height: int, width: int, num_pairs: int, memory_mb: int) -> list[tuple[int, int]]:

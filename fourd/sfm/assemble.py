@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fourd.camera import Camera, check_camera
+from fourd.camera import Camera, check_camera, folded_share
 from fourd.errors import InputError
 from fourd.film_cameras import FilmCamera, FilmCameras
 from fourd.io import read_json
@@ -104,6 +104,12 @@ def select_cameras(
         cameras = calibration.cameras[name_in_file]
         for i, camera in enumerate(cameras):
             check_camera(camera, where if len(cameras) == 1 else f"{where}, frame {i}")
+        folded = folded_share(cameras[0])
+        if folded > 0:
+            log.warning(
+                "%s: the lens folds back in %.1f %% of the picture, and depth there is wrong: fewer "
+                "coefficients would give every pixel a ray", where, 100 * folded,
+            )  # fmt: skip
         cameras = _at_scene_frames(calibration, name_in_file, ingested[name], num_frames, where)
         tracks[name] = tuple(_at_size(camera, ingested[name], where) for camera in cameras)
         if name_in_file in calibration.bounds:

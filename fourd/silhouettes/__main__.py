@@ -33,6 +33,9 @@ def run_plate(
         reason = reason_against(read_pair_statuses(rectifications), scene.inputs, options)
         if film.camera in scene.left_out:
             reason = f"left out: {scene.left_out[film.camera]}"
+        elif reason is None and options.use == "auto" and not scene.tracks[film.camera].is_static:
+            # Turned pictures leave movers in the plate, and a mover called background carves the hull away.
+            reason = "no background: the camera moves"
         if reason is not None:
             log.info("%s: %s", film.camera, reason)
             write_empty(output, film.camera, reason)
@@ -82,24 +85,33 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Command line of the stage."""
     parser = argparse.ArgumentParser(prog="python -m fourd.silhouettes")
     commands = parser.add_subparsers(dest="command", required=True)
+    many = {"nargs": "+", "type": Path, "required": True}
     plate = commands.add_parser("plate", help="what a camera films where nothing moves")
     plate.add_argument("--rectification", type=Path, nargs="*", default=[], help="files of all pairs")
     plate.add_argument("--background-film", type=Path, help="ingest file of a film of the empty scene")
     chunk = commands.add_parser("segment", help="what moves, frame by frame")
-    chunk.add_argument("--plate", type=Path, required=True, help="silhouettes/{cam}/plate.npz")
+    plate.add_argument("--film", type=Path, required=True, help="frames/cameras/{cam}.npz")
+    plate.add_argument("--output", type=Path, required=True)
+    chunk.add_argument("--film", **many, help="frames/cameras/{cam}.npz, of any number of cameras")
+    chunk.add_argument("--plate", **many, help="silhouettes/{cam}/plate.npz of the same cameras")
     chunk.add_argument("--frames", type=int, nargs="+", required=True, help="scene frames")
+    chunk.add_argument("--output", **many, help="one file per camera")
     for command in (plate, chunk):
-        command.add_argument("--film", type=Path, required=True, help="frames/cameras/{cam}.npz")
         command.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
-        command.add_argument("--output", type=Path, required=True)
         add_options(command, SilhouetteOptions)
     args = parser.parse_args(argv)
     set_num_threads(1)
     options = options_from_args(SilhouetteOptions, args)
     if args.command == "plate":
         run_plate(args.film, args.cameras, args.rectification, args.background_film, options, args.output)
-    else:
-        run_segment(args.film, args.cameras, args.plate, args.frames, options, args.output)
+        return
+    if not len(args.film) == len(args.plate) == len(args.output):
+        raise InputError(
+            f"expected one --film, --plate and --output per camera, got {len(args.film)}, {len(args.plate)} "
+            f"and {len(args.output)}: name as many of each"
+        )
+    for film, plate_path, output in zip(args.film, args.plate, args.output, strict=True):
+        run_segment(film, args.cameras, plate_path, args.frames, options, output)
 
 
 if __name__ == "__main__":

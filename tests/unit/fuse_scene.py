@@ -99,6 +99,7 @@ def assert_equal_views(a, b, colour_tolerance: int = 0) -> None:
     np.testing.assert_array_equal(a.support, b.support)
     np.testing.assert_array_equal(a.num_cameras, b.num_cameras)
     np.testing.assert_array_equal(a.source, b.source)
+    np.testing.assert_array_equal(a.depth_source, b.depth_source)
 
 
 def edge_cases(cameras: dict[str, Camera]) -> dict[str, list[PairFrame]]:

@@ -31,7 +31,7 @@ def test_stage_writes_the_contract(tmp_path):
     assert archive.frames() == [0, 1]
     keys = {f"{e}_{kind}" for e in ESTIMATES for kind in ("rgb", "valid")}
     arrays = archive.frame(1)
-    assert set(arrays) == keys | {"depth", "support", "num_cameras", "source"}
+    assert set(arrays) == keys | {"depth", "support", "num_cameras", "source", "depth_source"}
     height, width = SIZE[1], SIZE[0]
     assert arrays["consensus_rgb"].shape == (height, width, 3) and arrays["consensus_rgb"].dtype == np.uint8
     assert arrays["depth"].dtype == np.float32 and arrays["support"].dtype == np.uint8
