@@ -5,7 +5,8 @@
 Every folder below DATA that holds view1.png, view5.png and disp1.png, or im2.png, im6.png and
 disp2.png, is a pair; disp is an 8-bit image of disparity times 3 or 4 (Middlebury 2003, 2005).
 Writes stereo.csv: one row per setting, means over the pairs, as they are and (unlike_*) with gain,
-gamma, noise and JPEG on the right image; reliability.csv and reliability.png: expected against actual
+gamma, noise and JPEG on the right image, and (turned_*) with the right camera rolled and tilted by 0.1
+degrees; stereo.png: the front; reliability.csv and reliability.png: expected against actual
 error. Errors of the reliability are cut at 2 px. Of the true disparities of Middlebury pairs only the
 share that both images show (85 %) can be matched; density counts all of them.
 """
@@ -20,10 +21,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from benches.pareto import plot_front
 from fourd import io
 from fourd.camera import Camera
-from fourd.stereo.disparity import StereoOptions, make_matcher, match_pair
+from fourd.matchers import Matcher
+from fourd.stereo.disparity import PairDisparity, StereoOptions, find_row_shift, make_matcher, match_pair
 from fourd.stereo.rectify import Rectification
 
 LAYOUTS = (("view1.png", "view5.png", "disp1.png", 3), ("im2.png", "im6.png", "disp2.png", 4))
@@ -32,6 +36,7 @@ SETTINGS = {
     "unrefined": {"is_refined": False},
     "census": {"matcher": "census"},
     "hh4": {"sgbm_mode": "hh4"},
+    "hh4_dense": {"sgbm_mode": "hh4", "sgbm_uniqueness_percent": 0, "max_left_right_px": 2.0},
     "hh": {"sgbm_mode": "hh"},
     "sgbm": {"sgbm_mode": "sgbm"},
     "block3": {"sgbm_block_size_px": 3, "sgbm_penalty_small": 4, "sgbm_penalty_large": 32},
@@ -48,6 +53,8 @@ UNLIKE_SETTINGS = {
     "unlike_census": {"matcher": "census"},
     "unlike_hh4": {"sgbm_mode": "hh4"},
 }
+TURNED_SETTINGS = {"turned_default": {}, "turned_unaligned": {"align_rows": False}}
+TURN_DEG = 0.1
 GAIN, GAMMA, NOISE_LEVELS, JPEG_QUALITY = 0.8, 1.2, 4.0, 70
 CUT_PX = 2.0
 SIGMA_EDGES_PX = (0, 0.16, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7, 1.0, 1.4, np.inf)
@@ -93,6 +100,18 @@ def make_unlike(pair: Pair) -> Pair:
     return dataclasses.replace(pair, right=np.ascontiguousarray(decoded[..., ::-1]))
 
 
+def make_turned(pair: Pair) -> Pair:
+    """The pair with a right camera that is rolled and tilted by a little, unknown to its calibration."""
+    K = rectification_of(pair)[0].K_right
+    turn = Rotation.from_euler("zx", [TURN_DEG, TURN_DEG], degrees=True).as_matrix()
+    height, width = pair.truth.shape
+    right = cv2.warpPerspective(
+        pair.right, K @ turn @ np.linalg.inv(K), (width, height), flags=cv2.INTER_CUBIC,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return dataclasses.replace(pair, right=right)
+
+
 def rectification_of(pair: Pair) -> tuple[Rectification, Camera]:
     """The pair as it is: unit baseline, any focal length, and the camera of its images."""
     height, width = pair.truth.shape
@@ -107,7 +126,7 @@ def measure(pairs: Sequence[Pair], options: StereoOptions) -> dict[str, float]:
     matcher = make_matcher(options)
     rows = []
     start, cpu_start = time.perf_counter(), time.process_time()
-    results = [match_pair(*_arguments(pair), (pair.left, pair.right), matcher, options) for pair in pairs]
+    results = [_match(pair, matcher, options) for pair in pairs]
     seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
     for pair, result in zip(pairs, results, strict=True):
         known = np.isfinite(pair.truth)
@@ -138,7 +157,7 @@ def measure_reliability(pairs: Sequence[Pair], options: StereoOptions) -> list[d
     matcher = make_matcher(options)
     expected, actual = [], []
     for pair in pairs:
-        result = match_pair(*_arguments(pair), (pair.left, pair.right), matcher, options)
+        result = _match(pair, matcher, options)
         both = np.isfinite(pair.truth) & np.isfinite(result.left_disparity)
         expected.append(result.sigma_px / result.left_confidence[both])
         actual.append(np.minimum(np.abs(result.left_disparity - pair.truth)[both], CUT_PX))
@@ -168,9 +187,11 @@ def plot_reliability(rows: Sequence[dict[str, float]], path: Path) -> None:
     plt.close(figure)
 
 
-def _arguments(pair: Pair) -> tuple[Rectification, tuple[Camera, Camera]]:
+def _match(pair: Pair, matcher: Matcher, options: StereoOptions) -> PairDisparity:
     rectification, camera = rectification_of(pair)
-    return rectification, (camera, camera)
+    cameras, images = (camera, camera), (pair.left, pair.right)
+    rows = find_row_shift(rectification, cameras, images, options) if options.align_rows else None
+    return match_pair(rectification, cameras, images, matcher, options, rows)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -188,13 +209,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     # What is compiled on first use is not the first setting's time.
     measure(pairs[:1], StereoOptions())
     rows = []
-    for settings, data in ((SETTINGS, pairs), (UNLIKE_SETTINGS, unlike)):
+    turned = [make_turned(pair) for pair in pairs]
+    for settings, data in ((SETTINGS, pairs), (UNLIKE_SETTINGS, unlike), (TURNED_SETTINGS, turned)):
         for name, changes in settings.items():
             rows.append({"setting": name} | measure(data, dataclasses.replace(StereoOptions(), **changes)))
             print(
                 "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{v:16s}" for k, v in rows[-1].items())
             )
     io.write_csv(args.output / "stereo.csv", COLUMNS, rows)
+    plot_front(args.output / "stereo.png", rows[: len(SETTINGS)], "setting", "default")
     reliability = measure_reliability(pairs, StereoOptions())
     for row in reliability:
         print("  ".join(f"{key} {value:.3f}" for key, value in row.items()))

@@ -6,7 +6,6 @@ against a pinned SHA-256 before anything of it is unpacked.
 
 import argparse
 import dataclasses
-import hashlib
 import logging
 import os
 import shutil
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from fourd.camera import NUM_DISTORTION, Camera, CameraTrack, check_camera, tracks_to_dict
+from fourd.checksum import check_sha256
 from fourd.cli import run_stage
 from fourd.errors import InputError
 from fourd.io import write_json
@@ -78,17 +78,6 @@ def download(package: Package, folder: Path) -> Path:
         )
     check_sha256(files[0], package.sha256)
     return files[0]
-
-
-def check_sha256(path: Path, expected: str) -> None:
-    """Raise InputError unless the file has this SHA-256."""
-    with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != expected:
-        raise InputError(
-            f"expected {path.name} with SHA-256 {expected}, got {found}: the download is damaged or was "
-            "changed; run again, and if it stays so do not use it"
-        )
 
 
 def unpack(archive_path: Path, members: Mapping[str, str], folder: Path) -> None:

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from fourd.matchers import Match
-from fourd.stereo.sweep_kernels import aggregate, best_hypothesis
+from fourd.matchers.semi_global import aggregate, best_hypothesis
 
 _HALF_WIDTH_PX = 4
 _HALF_HEIGHT_PX = 3
@@ -24,13 +24,13 @@ _OUTSIDE_COST = 40
 
 
 class CensusMatcher:
-    """Census over 9x7 px, Hamming distances summed along eight paths."""
+    """Census over 9x7 px, Hamming distances averaged over 3x3 px and summed along eight paths."""
 
     def match(self, left: np.ndarray, right: np.ndarray, disparity_range: tuple[float, float]) -> Match:
         """See `Matcher.match`."""
         lowest, highest = math.floor(disparity_range[0]) - 1, math.ceil(disparity_range[1]) + 1
         ours, theirs = (_census(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in (left, right))
-        cost = _hamming(ours, theirs, lowest, highest - lowest + 1)
+        cost = _smooth(_hamming(ours, theirs, lowest, highest - lowest + 1))
         index = best_hypothesis(aggregate(cost, _PENALTY_SMALL, _PENALTY_LARGE))
         disparity = (index + lowest).astype(np.float32)
         return Match(disparity, np.isfinite(disparity).astype(np.float32))
@@ -71,3 +71,22 @@ def _hamming(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np
                     bits = (bits + (bits >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
                     cost[y, x, d] = np.uint8((bits * np.uint64(0x0101010101010101)) >> np.uint64(56))
     return cost
+
+
+@numba.njit(cache=True, nogil=True)
+def _smooth(cost: np.ndarray) -> np.ndarray:
+    """(H, W, D) uint8 mean over 3x3 px at each disparity; borders repeat."""
+    height, width, count = cost.shape
+    smooth = np.empty_like(cost)
+    total = np.empty(count, np.uint16)
+    for y in range(height):
+        for x in range(width):
+            total[:] = 4
+            for row in (max(y - 1, 0), y, min(y + 1, height - 1)):
+                for column in (max(x - 1, 0), x, min(x + 1, width - 1)):
+                    at = cost[row, column]
+                    for d in range(count):
+                        total[d] += at[d]
+            for d in range(count):
+                smooth[y, x, d] = total[d] // 9
+    return smooth

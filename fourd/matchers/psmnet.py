@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fourd.checksum import check_sha256
 from fourd.errors import InputError
-from fourd.fetch import check_sha256
 from fourd.matchers import Match
 from fourd.matchers.network import normalised_tensor, pad_to_multiple, shift_columns
 

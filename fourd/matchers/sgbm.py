@@ -94,10 +94,18 @@ class SgbmMatcher:
             mode=_MODES[options.mode],
         )
         fixed = sgbm.compute(padded_left, padded_right)[:, before : before + left.shape[1]]
-        found = (fixed >= lowest * _FIXED_POINT) & (fixed <= highest * _FIXED_POINT)
-        half = _FIXED_POINT // 2
-        whole = (fixed.astype(np.int32) + half) // _FIXED_POINT
-        offset = (fixed - whole * _FIXED_POINT + half).astype(np.intp)
-        disparity = whole.astype(np.float32) + _EQUIANGULAR[offset]
-        disparity[~found] = np.nan
-        return Match(disparity, found.astype(np.float32))
+        first = (lowest - 1) * _FIXED_POINT
+        # One below the lowest means not found; above the highest is only there to fill the multiple.
+        levels = _disparity_levels(first, (lowest + count) * _FIXED_POINT)
+        levels[:_FIXED_POINT] = np.nan
+        levels[highest * _FIXED_POINT - first + 1 :] = np.nan
+        disparity = levels[fixed.astype(np.intp) - first]
+        return Match(disparity, np.isfinite(disparity).astype(np.float32))
+
+
+def _disparity_levels(first: int, last: int) -> np.ndarray:
+    """(N,) float32 px of every value that StereoSGBM may give, first to last inclusive."""
+    fixed = np.arange(first, last + 1)
+    half = _FIXED_POINT // 2
+    whole = (fixed + half) // _FIXED_POINT
+    return whole.astype(np.float32) + _EQUIANGULAR[fixed - whole * _FIXED_POINT + half]

@@ -11,8 +11,8 @@ import numpy as np
 from fourd import cli, io
 from fourd.camera import CameraTrack, tracks_from_dict
 from fourd.errors import InputError
-from fourd.ingest import open_camera
-from fourd.stereo.disparity import StereoOptions, make_matcher, match_pair
+from fourd.ingest import FrameReader, open_camera
+from fourd.stereo.disparity import StereoOptions, find_row_shift, make_matcher, match_pair
 from fourd.stereo.files import (
     add_disparity_frame,
     disparity_meta,
@@ -22,6 +22,7 @@ from fourd.stereo.files import (
 from fourd.stereo.guard import describe_measures
 from fourd.stereo.rectification import STATUS_OK, SWEEP, PairRectification
 from fourd.stereo.rectify import RectifyOptions, rectify_tracks
+from fourd.stereo.rows import RowShift
 from fourd.stereo.sweep import SWEEP_SIGMA_PX, sweep_pair
 
 _log = logging.getLogger(__name__)
@@ -74,6 +75,7 @@ def run_disparity(
         tracks = read_tracks(cameras_path, pair.left, pair.right)
         density = []
         with open_camera(film_paths[0]) as left, open_camera(film_paths[1]) as right:
+            rows = _measure_rows(pair, tracks, (left, right), options)
             for frame in frames:
                 rectification = pair.at(frame)
                 views = tracks[0].at(frame), tracks[1].at(frame)
@@ -81,7 +83,7 @@ def run_disparity(
                 if rectification.kind == SWEEP:
                     disparity = sweep_pair(rectification, views, images, options)
                 else:
-                    disparity = match_pair(rectification, views, images, matcher, options)
+                    disparity = match_pair(rectification, views, images, matcher, options, rows)
                 add_disparity_frame(writer, frame, disparity)
                 density.append(
                     (
@@ -94,6 +96,34 @@ def run_disparity(
             "%s-%s frames %d to %d: %.0f %% of the rectified pixels matched",
             pair.left, pair.right, frames[0], frames[-1], 100 * np.mean(density),
         )  # fmt: skip
+
+
+def _measure_rows(
+    pair: PairRectification,
+    tracks: tuple[CameraTrack, CameraTrack],
+    films: tuple[FrameReader, FrameReader],
+    options: StereoOptions,
+) -> RowShift | None:
+    """Misalignment of a planar pair's rows in the scene's first frame.
+
+    One for all frames, or depth would tremble; the same one in every chunk, or chunks would differ.
+    """
+    if not options.align_rows or pair.kind == SWEEP:
+        return None
+    images = films[0].read(0), films[1].read(0)
+    rows = find_row_shift(pair.at(0), (tracks[0].at(0), tracks[1].at(0)), images, options)
+    _log.info("%s-%s rows: %s", pair.left, pair.right, _describe_rows(rows))
+    return rows
+
+
+def _describe_rows(rows: RowShift | None) -> str:
+    if rows is None:
+        return "no significant misalignment"
+    return (
+        f"{rows.before_px:.2f} px off over {rows.num_matches} matches, corrected to {rows.after_px:.2f} px "
+        f"({rows.offset:+.2f} px, {1000 * rows.along_y:+.2f} along y and {1000 * rows.along_x:+.2f} along x "
+        "per 1000 px)"
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from fourd.matchers import Match
-from fourd.matchers.subpixel import fit_planes
+from fourd.matchers.subpixel import PLANE_OFFSETS_PX, PLANE_REACH_PX, fit_planes
 
 # Variance of a disparity in px^2, linear in what the match itself shows: left-right difference (px),
 # spread (root mean square distance from the local plane, px) and share of unmatched neighbours.
@@ -21,8 +21,6 @@ _GAP_PX2 = 3.39
 _MIN_SIGMA_PX = 0.15
 """No cue foretells smaller errors; that is confidence 1."""
 _CUE_WINDOW_PX = 5
-_PLANE_HALF_PX = 3
-_PLANE_REACH_PX = np.float32(1.5)
 _MIN_CONFIDENCE = 0.1
 
 
@@ -39,6 +37,7 @@ class StereoOptions:
     sgbm_uniqueness_percent: int = 5
     network_file: str = ""
     match_tones: bool = True
+    align_rows: bool = True
     is_refined: bool = True
     interpolation: str = "cubic"
     max_left_right_px: float = 1.5
@@ -85,7 +84,7 @@ def _window_sum(array: np.ndarray, side: int) -> np.ndarray:
 
 def _spread_px2(disparity: np.ndarray) -> np.ndarray:
     """(H, W) float32 mean square distance of the disparities in a window from their local planes, px^2."""
-    apart = fit_planes(disparity, _PLANE_HALF_PX, _PLANE_REACH_PX) - disparity
+    apart = fit_planes(disparity, PLANE_OFFSETS_PX, PLANE_REACH_PX) - disparity
     known = np.isfinite(apart)
     squares = _window_sum(np.where(known, apart, np.float32(0)) ** 2, _CUE_WINDOW_PX)
     return squares / np.maximum(_window_sum(known.view(np.uint8), _CUE_WINDOW_PX), np.float32(1))

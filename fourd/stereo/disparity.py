@@ -1,6 +1,7 @@
 """Disparity of both images of a pair: resampled, matched both ways, checked one against the other."""
 
 import dataclasses
+import functools
 
 import cv2
 import numpy as np
@@ -13,9 +14,13 @@ from fourd.matchers.subpixel import refine
 from fourd.stereo.check import StereoOptions, check_direction, left_right_difference
 from fourd.stereo.normalise import match_tones
 from fourd.stereo.rectify import Rectification, sampling_maps
+from fourd.stereo.rows import RowShift, measure_rows
 
 MATCHERS = ("sgbm", "census", "psmnet", "network")
 _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
+
+# Both sides of a pair whose cameras stand still have the same maps in every frame.
+_cached_maps = functools.lru_cache(maxsize=2)(sampling_maps)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,11 +85,16 @@ def match_right(
 
 
 def rectify_image(
-    image: np.ndarray, rectification: Rectification, camera: Camera, side: str, interpolation: str
+    image: np.ndarray,
+    rectification: Rectification,
+    camera: Camera,
+    side: str,
+    interpolation: str,
+    rows: RowShift | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Resample a source image once, lens and rotation together.
 
-    image: (h, w, 3) uint8 of `camera`;  side: `left` or `right`
+    image: (h, w, 3) uint8 of `camera`;  side: `left` or `right`;  rows: of `sampling_maps`
     Returns the rectified image (H, W, 3) uint8 and valid (H, W) bool
     Raises InputError for an unknown interpolation or an image that is not the camera's size
     """
@@ -98,12 +108,26 @@ def rectify_image(
             f"expected a {side} image of {camera.size[0]}x{camera.size[1]} px as in the cameras file, got "
             f"{image.shape[1]}x{image.shape[0]}: calibrate at the size of the frames"
         )
-    map_x, map_y, valid = sampling_maps(rectification, camera, side)
+    map_x, map_y, valid = _cached_maps(rectification, camera, side, rows)
     # Replicated borders keep false edges, and thus false matches, out of the search.
     rectified = cv2.remap(
         image, map_x, map_y, _INTERPOLATIONS[interpolation], borderMode=cv2.BORDER_REPLICATE
     )
     return rectified, valid
+
+
+def find_row_shift(
+    rectification: Rectification,
+    cameras: tuple[Camera, Camera],
+    images: tuple[np.ndarray, np.ndarray],
+    options: StereoOptions,
+) -> RowShift | None:
+    """Vertical misalignment of a planar pair, None where it is not significant. Arguments as `match_pair`."""
+    (left, left_valid), (right, right_valid) = (
+        rectify_image(image, rectification, camera, side, options.interpolation)
+        for image, camera, side in zip(images, cameras, ("left", "right"), strict=True)
+    )
+    return measure_rows(left, right, (left_valid, right_valid), rectification.disparity_range)
 
 
 def match_pair(
@@ -112,21 +136,28 @@ def match_pair(
     images: tuple[np.ndarray, np.ndarray],
     matcher: Matcher,
     options: StereoOptions,
+    rows: RowShift | None = None,
 ) -> PairDisparity:
     """Disparity of both images of a pair at one instant.
 
     cameras, images: left and right source views, (h, w, 3) uint8 RGB each of its camera's size
-    Raises InputError as `rectify_image`
+    rows: how far the right image lies off the rows, of `find_row_shift`
+    Raises ValueError for a swept pair, whose rows do not correspond; InputError as `rectify_image`
     """
+    if rectification.swept is not None:
+        raise ValueError("expected a planar pair, got a swept one: use fourd.stereo.sweep.sweep_pair")
     left, left_valid = rectify_image(images[0], rectification, cameras[0], "left", options.interpolation)
-    right, right_valid = rectify_image(images[1], rectification, cameras[1], "right", options.interpolation)
+    right, right_valid = rectify_image(
+        images[1], rectification, cameras[1], "right", options.interpolation, rows
+    )
     if options.match_tones:
         right = match_tones(right, right_valid, left, left_valid)
     from_left = matcher.match(left, right, rectification.disparity_range)
     from_right = match_right(matcher, left, right, rectification.disparity_range)
     if options.is_refined:
-        from_left = Match(refine(from_left.disparity, left, right, direction=-1), from_left.confidence)
-        from_right = Match(refine(from_right.disparity, right, left, direction=1), from_right.confidence)
+        greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (left, right)]
+        from_left = Match(refine(from_left.disparity, *greys, direction=-1), from_left.confidence)
+        from_right = Match(refine(from_right.disparity, *greys[::-1], direction=1), from_right.confidence)
     to_right = left_right_difference(
         from_left.disparity, left_valid, from_right.disparity, right_valid, direction=-1
     )

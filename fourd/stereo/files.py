@@ -138,8 +138,8 @@ def decode_disparity(fixed: np.ndarray) -> np.ndarray:
 
 
 def encode_confidence(confidence: np.ndarray) -> np.ndarray:
-    """(H, W) float 0..1 to uint8, 255 = 1."""
-    return np.rint(confidence * np.float32(255)).astype(np.uint8)
+    """(H, W) float to uint8, 255 = 1; what lies outside 0..1 is cut off."""
+    return np.rint(np.clip(confidence, 0, 1) * np.float32(255)).astype(np.uint8)
 
 
 def decode_confidence(levels: np.ndarray) -> np.ndarray:

@@ -107,12 +107,16 @@ def epipole_outside(camera: Camera, other_center: np.ndarray) -> float:
     direction = camera.R @ (other_center - camera.center)
     if not np.any(direction):
         return _NAN
-    low, high = field_of_view(camera)
-    if abs(direction[2]) < 1e-12 * np.linalg.norm(direction):
+    # The square of a tiny baseline would be 0, and so would its length.
+    direction /= np.abs(direction).max()
+    if abs(direction[2]) < 1e-12:
         return float("inf")
+    low, high = field_of_view(camera)
     epipole = direction[:2] / direction[2]
-    outside = np.maximum(low - epipole, epipole - high) / (high - low)
-    return float(max(outside.max(), 0.0))
+    # A picture one pixel wide shows a field of no width: all beside it is infinitely far outside.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        outside = np.maximum(low - epipole, epipole - high) / (high - low)
+    return max(0.0, float(np.fmax.reduce(outside)))
 
 
 def extremes(guards: Sequence[Guard]) -> dict[str, tuple[float, float]]:

@@ -36,6 +36,7 @@ from fourd.stereo.rectification import (
     Rectification,
     with_one_size,
 )
+from fourd.stereo.rows import RowShift
 from fourd.stereo.sweep_frame import measure_sweep, sweep_sides, swept_rectification
 from fourd.stereo.volume import (
     RectifyOptions,
@@ -229,18 +230,22 @@ def rectify_tracks(left: CameraTrack, right: CameraTrack, options: RectifyOption
 
 
 def sampling_maps(
-    rectification: Rectification, camera: Camera, side: str
+    rectification: Rectification, camera: Camera, side: str, rows: RowShift | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where each rectified pixel lies in a source image: lens and rotation in one resampling.
 
     side: `left` or `right`;  camera: the source view
+    rows: how far the right image of a planar pair lies off the left one's rows, to be undone
     Returns map_x, map_y (H, W) float32 px of the source, for cv2.remap, and valid (H, W) bool:
     the place is inside the source image, so that interpolation invents nothing
     """
     ideal = rectification.camera(side)
     K, (width, height) = ideal.K, ideal.size
     x = (np.arange(width) - K[0, 2]) / K[0, 0]
-    y = (np.arange(height)[:, None] - K[1, 2]) / K[1, 1]
+    y = np.arange(height)[:, None]
+    if rows is not None and side == "right":
+        y = y + rows.offset + rows.along_y * y + rows.along_x * np.arange(width)
+    y = (y - K[1, 2]) / K[1, 1]
     in_camera = camera.R @ ideal.R.T
     if not camera.is_distorted:
         in_camera = camera.K @ in_camera

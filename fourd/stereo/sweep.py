@@ -15,13 +15,12 @@ import numpy as np
 
 from fourd.camera import Camera
 from fourd.matchers import Match
+from fourd.matchers.semi_global import aggregate, best_hypothesis
 from fourd.stereo.check import StereoOptions, check_direction
 from fourd.stereo.disparity import PairDisparity, rectify_image
 from fourd.stereo.rectification import Rectification
 from fourd.stereo.sweep_frame import plane_motion
 from fourd.stereo.sweep_kernels import (
-    aggregate,
-    best_hypothesis,
     fit_planes,
     refine_on_planes,
     reproject,

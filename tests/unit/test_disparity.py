@@ -203,6 +203,11 @@ def test_fixed_point_round_trip():
         encode_disparity(np.array([[1100.0]], np.float32))
 
 
+def test_confidence_beyond_its_range_is_cut_off_and_never_wraps():
+    found = decode_confidence(encode_confidence(np.array([-0.1, 0.0, 1.0, 1.01], np.float32)))
+    np.testing.assert_array_equal(found, [0, 0, 1, 1])
+
+
 def test_rectification_file_round_trip(tmp_path):
     tracks = [
         CameraTrack("a", (on_arc(0),), NEAR, FAR),

@@ -227,3 +227,13 @@ class TestFiles:
 def test_poses_alone_are_measured_for_one_centre():
     guard = measure_poses(BEHIND, BEHIND)
     assert guard.baseline == 0 and guard.axes_deg == 0 and np.isnan(guard.epipole_left)
+
+
+@pytest.mark.filterwarnings("error")
+def test_epipole_of_an_axis_across_a_tiny_baseline_and_of_one_column():
+    camera = on_arc(0)
+    across = camera.R.T @ np.array([1e-170, 0, 0])
+    centred = dataclasses.replace(camera, t=np.zeros(3))
+    assert epipole_outside(centred, across) == float("inf")
+    column = dataclasses.replace(camera, size=(1, camera.size[1]))
+    assert epipole_outside(column, camera.center + camera.R.T @ np.array([1.0, 0, 1.0])) == float("inf")

@@ -11,8 +11,10 @@ from fourd.cli import run_stage
 from fourd.errors import InputError
 from fourd.fuse.files import read_pair_frame
 from fourd.io import Archive, write_json, write_png
+from fourd.matchers.semi_global import aggregate, best_hypothesis
 from fourd.stereo.__main__ import main
 from fourd.stereo.check import StereoOptions
+from fourd.stereo.disparity import make_matcher, match_pair
 from fourd.stereo.files import read_disparity_frame
 from fourd.stereo.rectification import Rectification
 from fourd.stereo.rectify import (
@@ -23,7 +25,7 @@ from fourd.stereo.rectify import (
 )
 from fourd.stereo.sweep import SWEEP_SIGMA_PX, lens_of, sweep_pair
 from fourd.stereo.sweep_frame import plane_motion
-from fourd.stereo.sweep_kernels import aggregate, best_hypothesis, fit_planes, warp_by_plane
+from fourd.stereo.sweep_kernels import fit_planes, warp_by_plane
 from tests.films import put_on_clock
 from tests.unit.test_rectify import LENS, camera_at, rectified
 
@@ -193,6 +195,15 @@ def test_image_of_another_size_is_refused():
         sweep_pair(
             rectified(left, right), (left, right), (np.zeros((20, 10, 3), np.uint8),) * 2, StereoOptions()
         )
+
+
+def test_rows_of_a_swept_pair_are_not_matched():
+    left, right = behind(), before()
+    result = swept(left, right)
+    images = render(left)[0], render(right)[0]
+    options = StereoOptions()
+    with pytest.raises(ValueError, match="sweep_pair"):
+        match_pair(result.rectification, (left, right), images, make_matcher(options), options)
 
 
 def test_warp_is_the_projection_of_the_plane():
