@@ -129,11 +129,9 @@ def disparities_of_view(wildcards):
 
 
 def silhouettes_of_view(wildcards):
-    """Silhouettes of the cameras that may serve a view: its own would tell what is to be predicted."""
     return expand(
-        "<results>/{scene}/silhouettes/{cam}/{chunk}.npz",
+        "<results>/{scene}/silhouettes/{chunk}.npz",
         scene=wildcards.scene,
-        cam=[cam for cam in SCENE.inputs if cam != wildcards.view],
         chunk=scene_chunks(wildcards.view, wildcards.chunk),
     )
 

@@ -9,7 +9,7 @@ rule fuse_training:
         cameras="<results>/{scene}/sfm/cameras.json",
         films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=expand("<results>/{{scene}}/disparity/{pair}/{{chunk}}.npz", pair=SCENE.pairs),
-        silhouettes=expand("<results>/{{scene}}/silhouettes/{cam}/{{chunk}}.npz", cam=SCENE.inputs),
+        silhouettes="<results>/{scene}/silhouettes/{chunk}.npz",
     output:
         [
             intermediate("foreground", f"<results>/{{scene}}/foreground/{cam}/{{chunk}}.npz")

@@ -1,11 +1,32 @@
 """What moves in front of each camera's background: depth for captures too wide for stereo."""
 
 
+rule judge_need:
+    input:
+        cameras="<results>/{scene}/sfm/cameras.json",
+        rectification=expand("<results>/{{scene}}/rectification/{pair}.npz", pair=SCENE.pairs),
+    output:
+        "<results>/{scene}/silhouettes/need.json",
+    log:
+        "<logs>/{scene}/judge_need.log",
+    benchmark:
+        "<benchmarks>/{scene}/judge_need.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        options=options("silhouettes"),
+        version=fourd_config.stage_version("silhouettes"),
+    shell:
+        "python -m fourd.silhouettes need --cameras {input.cameras}"
+        " --rectification {input.rectification} {params.options} --output {output} 2> {log}"
+
+
 rule background_plate:
     input:
         film="<results>/{scene}/frames/cameras/{cam}.npz",
         cameras="<results>/{scene}/sfm/cameras.json",
-        rectification=expand("<results>/{{scene}}/rectification/{pair}.npz", pair=SCENE.pairs),
+        need="<results>/{scene}/silhouettes/need.json",
         background=empty_scene_of,
     output:
         "<results>/{scene}/silhouettes/{cam}/plate.npz",
@@ -22,8 +43,7 @@ rule background_plate:
         version=fourd_config.stage_version("silhouettes"),
     shell:
         "python -m fourd.silhouettes plate --film {input.film} --cameras {input.cameras}"
-        " --rectification {input.rectification} {params.background} {params.options}"
-        " --output {output} 2> {log}"
+        " --need {input.need} {params.background} {params.options} --output {output} 2> {log}"
 
 
 # All cameras of a chunk in one job: most scenes need no silhouettes, and then a job says no more than so.
@@ -33,7 +53,7 @@ rule silhouettes:
         plates=expand("<results>/{{scene}}/silhouettes/{cam}/plate.npz", cam=SCENE.inputs),
         cameras="<results>/{scene}/sfm/cameras.json",
     output:
-        expand("<results>/{{scene}}/silhouettes/{cam}/{{chunk}}.npz", cam=SCENE.inputs),
+        "<results>/{scene}/silhouettes/{chunk}.npz",
     log:
         "<logs>/{scene}/silhouettes/{chunk}.log",
     benchmark:

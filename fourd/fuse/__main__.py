@@ -78,7 +78,8 @@ def run(
                 loaded = disparities.at(scene_frame, options.memory_mb), *pictures.at(scene_frame)
             fused = fuse_view(
                 entry.camera, *loaded, options, estimates, device=device,
-                silhouettes=silhouettes.at(entry.scene_frame), depth_range=depth_range, hull_options=hull_options,
+                silhouettes=silhouettes.at(entry.scene_frame), depth_range=depth_range,
+                hull_options=hull_options,
             )  # fmt: skip
             _write_frame(writer, frame, fused)
             meta["frame_status"][f"{frame:06d}"] = fused.status
@@ -112,9 +113,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     command.add_argument("--frames", type=int, nargs="+", required=True, help="output frames of the views")
     command.add_argument("--disparity", type=Path, nargs="*", default=[], help="files of all pairs")
     command.add_argument("--films", nargs="*", default=[], help="frames/cameras/{cam}.npz, or CAMERA=PATH")
-    command.add_argument(
-        "--silhouettes", type=Path, nargs="*", default=[], help="silhouettes/{cam}/{chunk}.npz"
-    )
+    command.add_argument("--silhouettes", type=Path, nargs="*", default=[], help="silhouettes/{chunk}.npz")
     command.add_argument("--estimates", nargs="+", choices=ESTIMATES, default=list(ESTIMATES))
     command.add_argument("--device", default="auto", help="auto, cpu or a torch device")
     command.add_argument("--output", type=Path, nargs="+", required=True, help="one file per view file")

@@ -173,34 +173,32 @@ class Silhouettes:
     """
 
     def __init__(self, paths: Sequence[Path], exclude: str) -> None:
-        """paths: silhouettes/{cam}/{chunk}.npz;  exclude: the target camera's name.
+        """paths: silhouettes/{chunk}.npz;  exclude: the target camera's name.
 
         Raises InputError for a file that holds no silhouettes.
         """
         self.status: dict[str, str] = {}
-        self._archives: list[tuple[str, Archive, frozenset[int]]] = []
+        self._archives: list[tuple[Archive, list[str], frozenset[int]]] = []
         for path in paths:
             archive = Archive(path)
-            try:
-                name, status = archive.meta["camera"], archive.meta["status"]
-            except KeyError as error:
+            cameras = archive.meta.get("cameras")
+            if not isinstance(cameras, dict):
                 raise InputError(
-                    f"expected silhouettes at {path}, its meta lacks {error}: delete it and run again"
-                ) from None
-            if status != "ok" or name == exclude:
-                self.status[name] = status
-                archive.close()
-            else:
-                self._archives.append((name, archive, frozenset(archive.frames())))
+                    f"expected silhouettes at {path}, its meta lacks `cameras`: delete it and run again"
+                )
+            self.status |= {name: status for name, status in cameras.items() if status != "ok"}
+            names = [name for name, status in cameras.items() if status == "ok" and name != exclude]
+            self._archives.append((archive, names, frozenset(archive.frames())))
 
     def at(self, frame: int) -> dict[str, np.ndarray]:
         """name -> (H, W) uint8 mask, 255 moving, 0 background, 128 unknown, at a scene frame."""
-        return {
-            name: archive[f"{frame:06d}/mask"] for name, archive, frames in self._archives if frame in frames
-        }
+        for archive, names, frames in self._archives:
+            if frame in frames:
+                return {name: archive[f"{frame:06d}/{name}"] for name in names}
+        return {}
 
     def close(self) -> None:
-        for _, archive, _ in self._archives:
+        for archive, _, _ in self._archives:
             archive.close()
 
 

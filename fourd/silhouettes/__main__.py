@@ -1,6 +1,7 @@
 """Command line of the stage `silhouettes`."""
 
 import argparse
+import contextlib
 import logging
 import sys
 from collections.abc import Sequence
@@ -9,7 +10,7 @@ from pathlib import Path
 from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
 from fourd.errors import InputError
 from fourd.ingest import FrameReader, open_camera
-from fourd.io import Archive, ArchiveWriter
+from fourd.io import Archive, ArchiveWriter, read_json, write_json
 from fourd.sfm.cameras import SceneCameras, read_cameras
 from fourd.silhouettes.files import Plates, write_empty, write_plate
 from fourd.silhouettes.need import read_pair_statuses, reason_against
@@ -22,7 +23,7 @@ log = logging.getLogger(__name__)
 def run_plate(
     film_path: Path,
     cameras_path: Path,
-    rectifications: Sequence[Path],
+    need_path: Path,
     background_film: Path | None,
     options: SilhouetteOptions,
     output: Path,
@@ -30,7 +31,8 @@ def run_plate(
     """Write silhouettes/{cam}/plate.npz; empty, with the reason as status, where none is needed or made."""
     scene = read_cameras(cameras_path)
     with open_camera(film_path) as film:
-        reason = reason_against(read_pair_statuses(rectifications), scene.inputs, options)
+        status = str(read_json(need_path)["status"])
+        reason = None if status == "ok" else status
         if film.camera in scene.left_out:
             reason = f"left out: {scene.left_out[film.camera]}"
         elif reason is None and options.use == "auto" and not scene.tracks[film.camera].is_static:
@@ -44,33 +46,46 @@ def run_plate(
         write_plate(output, film, scene.tracks[film.camera], background_film, options)
 
 
+def run_need(
+    cameras_path: Path, rectifications: Sequence[Path], options: SilhouetteOptions, output: Path
+) -> None:
+    """Write silhouettes/need.json: whether silhouettes are made, or why not."""
+    scene = read_cameras(cameras_path)
+    reason = reason_against(read_pair_statuses(rectifications), scene.inputs, options)
+    log.info("silhouettes: %s", reason or "needed")
+    write_json(output, {"status": reason or "ok"})
+
+
 def run_segment(
-    film_path: Path,
+    film_paths: Sequence[Path],
     cameras_path: Path,
-    plate_path: Path,
+    plate_paths: Sequence[Path],
     frames: Sequence[int],
     options: SilhouetteOptions,
     output: Path,
 ) -> None:
-    """Write silhouettes/{cam}/{chunk}.npz; the status of the plate is copied."""
-    archive = Archive(plate_path)
-    with open_camera(film_path) as film:
-        status = str(archive.meta["status"])
-        if status != "ok":
-            write_empty(output, film.camera, status)
-            return
-        scene = read_cameras(cameras_path)
-        _check_calibrated(film, scene)
-        plates = Plates(archive, scene.tracks[film.camera], options.jitter_px)
-        with ArchiveWriter(output, {"camera": film.camera, "status": "ok"}) as writer:
-            for frame in frames:
+    """Write silhouettes/{chunk}.npz of all cameras; the status of every plate is copied."""
+    scene = read_cameras(cameras_path)
+    meta: dict[str, dict[str, str]] = {"cameras": {}}
+    with contextlib.ExitStack() as stack:
+        films: list[tuple[FrameReader, Plates]] = []
+        for film_path, plate_path in zip(film_paths, plate_paths, strict=True):
+            archive = stack.enter_context(contextlib.closing(Archive(plate_path)))
+            name, status = str(archive.meta["camera"]), str(archive.meta["status"])
+            meta["cameras"][name] = status
+            if status == "ok":
+                film = stack.enter_context(open_camera(film_path))
+                _check_calibrated(film, scene)
+                films.append((film, Plates(archive, scene.tracks[film.camera], options.jitter_px)))
+        writer = stack.enter_context(ArchiveWriter(output, meta))
+        for frame in frames if films else ():
+            for film, plates in films:
                 mask = segment(film.read(frame), plates.at(frame), options)
-                writer.add_frame(frame, mask=mask)
+                writer.add_frame(frame, **{film.camera: mask})
                 log.info(
                     "%s frame %d: %.1f %% moves, %.1f %% unknown", film.camera, frame,
                     100 * (mask == MOVING).mean(), 100 * (mask == UNKNOWN).mean(),
                 )  # fmt: skip
-    archive.close()
 
 
 def _check_calibrated(film: FrameReader, scene: SceneCameras) -> None:
@@ -86,32 +101,34 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m fourd.silhouettes")
     commands = parser.add_subparsers(dest="command", required=True)
     many = {"nargs": "+", "type": Path, "required": True}
+    need = commands.add_parser("need", help="whether stereo leaves cameras alone")
+    need.add_argument("--rectification", type=Path, nargs="*", default=[], help="files of all pairs")
     plate = commands.add_parser("plate", help="what a camera films where nothing moves")
-    plate.add_argument("--rectification", type=Path, nargs="*", default=[], help="files of all pairs")
+    plate.add_argument("--need", type=Path, required=True, help="silhouettes/need.json")
     plate.add_argument("--background-film", type=Path, help="ingest file of a film of the empty scene")
-    chunk = commands.add_parser("segment", help="what moves, frame by frame")
     plate.add_argument("--film", type=Path, required=True, help="frames/cameras/{cam}.npz")
-    plate.add_argument("--output", type=Path, required=True)
+    chunk = commands.add_parser("segment", help="what moves, frame by frame")
     chunk.add_argument("--film", **many, help="frames/cameras/{cam}.npz, of any number of cameras")
     chunk.add_argument("--plate", **many, help="silhouettes/{cam}/plate.npz of the same cameras")
     chunk.add_argument("--frames", type=int, nargs="+", required=True, help="scene frames")
-    chunk.add_argument("--output", **many, help="one file per camera")
-    for command in (plate, chunk):
+    for command in (need, plate, chunk):
         command.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
+        command.add_argument("--output", type=Path, required=True)
         add_options(command, SilhouetteOptions)
     args = parser.parse_args(argv)
     set_num_threads(1)
     options = options_from_args(SilhouetteOptions, args)
-    if args.command == "plate":
-        run_plate(args.film, args.cameras, args.rectification, args.background_film, options, args.output)
-        return
-    if not len(args.film) == len(args.plate) == len(args.output):
+    if args.command == "need":
+        run_need(args.cameras, args.rectification, options, args.output)
+    elif args.command == "plate":
+        run_plate(args.film, args.cameras, args.need, args.background_film, options, args.output)
+    elif len(args.film) != len(args.plate):
         raise InputError(
-            f"expected one --film, --plate and --output per camera, got {len(args.film)}, {len(args.plate)} "
-            f"and {len(args.output)}: name as many of each"
+            f"expected one --film and one --plate per camera, got {len(args.film)} and {len(args.plate)}: "
+            "name as many of each"
         )
-    for film, plate_path, output in zip(args.film, args.plate, args.output, strict=True):
-        run_segment(film, args.cameras, plate_path, args.frames, options, output)
+    else:
+        run_segment(args.film, args.cameras, args.plate, args.frames, options, args.output)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The stage `fuse` on files: contract, refusals, determinism, error messages."""
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -11,7 +12,8 @@ import yaml
 from fourd.errors import InputError
 from fourd.fuse import ESTIMATES, FuseOptions
 from fourd.fuse.__main__ import main
-from fourd.io import Archive, write_json
+from fourd.fuse.files import Silhouettes
+from fourd.io import Archive, ArchiveWriter, write_json
 from tests.unit.fuse_scene import SIZE, pair_from_plane, stage_words, write_pair, write_scene
 
 
@@ -83,3 +85,40 @@ def test_stage_reports_cameras_that_are_not_calibrated(tmp_path):
     write_json(tmp_path / "cameras.json", document)
     with pytest.raises(InputError, match="cam02"):
         main(["foreground", *stage_words(tmp_path), "--device", "cpu", "--output", str(tmp_path / "o.npz")])
+
+
+def write_silhouettes(path, cameras, frames):
+    with ArchiveWriter(
+        path, {"cameras": dict.fromkeys(cameras, "ok") | {"cam09": "no background"}}
+    ) as writer:
+        for frame in frames:
+            writer.add_frame(frame, **{name: np.full(SIZE[::-1], 255, np.uint8) for name in cameras})
+
+
+def test_stage_takes_depth_from_silhouettes_where_no_pair_is_usable(tmp_path):
+    cameras = write_scene(tmp_path)
+    for path in (tmp_path / "disparity").glob("*.npz"):
+        left, right = path.stem.split("-")
+        write_pair(path, pair_from_plane(cameras, left, right, 4.0), (), status="too wide")
+    write_silhouettes(tmp_path / "masks.npz", cameras, [0, 1])
+    words = ["foreground", *stage_words(tmp_path), "--silhouettes", str(tmp_path / "masks.npz")]
+    main([*words, "--device", "cpu", "--output", str(tmp_path / "o.npz")])
+    with contextlib.closing(Archive(tmp_path / "o.npz")) as archive:
+        arrays = archive.frame(0)
+    is_hull = arrays["depth_source"] == 2
+    assert is_hull.any() and not (arrays["depth_source"] == 1).any()
+    np.testing.assert_array_equal(is_hull, np.isfinite(arrays["depth"]))
+    np.testing.assert_array_equal(is_hull, arrays["consensus_valid"])
+    assert not arrays["support"].any()
+
+
+def test_own_silhouette_is_not_used(tmp_path):
+    write_silhouettes(tmp_path / "masks.npz", ["cam00", "cam01"], [3])
+    silhouettes = Silhouettes([tmp_path / "masks.npz"], exclude="cam01")
+    assert list(silhouettes.at(3)) == ["cam00"] and silhouettes.at(4) == {}
+    assert silhouettes.status == {"cam09": "no background"}
+    silhouettes.close()
+    with ArchiveWriter(tmp_path / "other.npz", {"view": "cam00"}):
+        pass
+    with pytest.raises(InputError, match="its meta lacks `cameras`: delete it"):
+        Silhouettes([tmp_path / "other.npz"], exclude="cam01")

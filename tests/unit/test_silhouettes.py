@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -224,9 +225,14 @@ def write_event(folder: Path, num_frames: int = 5) -> dict[str, Path]:
 
 
 def run_plate(files: dict[str, Path], output: Path, *more: str) -> Archive:
+    need = output.with_name("need.json")
     main(
-        ["plate", "--film", str(files["film"]), "--cameras", str(files["cameras"]), "--rectification",
-         str(files["pair"]), "--output", str(output), *more]
+        ["need", "--cameras", str(files["cameras"]), "--rectification", str(files["pair"]),
+         "--output", str(need)]
+    )  # fmt: skip
+    main(
+        ["plate", "--film", str(files["film"]), "--cameras", str(files["cameras"]), "--need", str(need),
+         "--output", str(output), *more]
     )  # fmt: skip
     return Archive(output)
 
@@ -243,9 +249,9 @@ def test_command_line_from_film_to_masks(tmp_path: Path) -> None:
     files = write_event(tmp_path)
     assert run_plate(files, tmp_path / "plate.npz").meta["made_from"] == "own frames"
     masks = run_segment(files, tmp_path / "plate.npz", tmp_path / "masks.npz")
-    assert (masks.meta["camera"], masks.meta["status"], masks.frames()) == ("cam01", "ok", [1, 2])
-    assert overlap(masks["000001/mask"]) > 0.9
-    assert not masks["000002/mask"].any()
+    assert (masks.meta["cameras"], masks.frames()) == ({"cam01": "ok"}, [1, 2])
+    assert overlap(masks["000001/cam01"]) > 0.9
+    assert not masks["000002/cam01"].any()
     run_segment(files, tmp_path / "plate.npz", tmp_path / "again.npz")
     assert (tmp_path / "masks.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
 
@@ -256,7 +262,7 @@ def test_film_of_the_empty_scene_is_the_plate(tmp_path: Path) -> None:
     flags = ("--background-film", str(tmp_path / "empty.ingest.json"))
     plate = run_plate(files, tmp_path / "plate.npz", *flags)
     assert plate.meta["made_from"] == "film of the empty scene" and "unrest" not in plate
-    assert overlap(run_segment(files, tmp_path / "plate.npz", tmp_path / "m.npz")["000001/mask"]) > 0.9
+    assert overlap(run_segment(files, tmp_path / "plate.npz", tmp_path / "m.npz")["000001/cam01"]) > 0.9
     write_film(tmp_path, "small", [shoot(scene(), 1)[:40] for _ in range(3)])
     flags = ("--background-film", str(tmp_path / "small.ingest.json"))
     with pytest.raises(InputError, match="at 96 x 72 like the camera's own, got 96 x 40"):
@@ -268,8 +274,21 @@ def test_reasons_are_carried_through_the_files(tmp_path: Path) -> None:
     reason = "no background: a plate takes 3 pictures, got 2"
     assert run_plate(files, tmp_path / "plate.npz").meta["status"] == reason
     masks = run_segment(files, tmp_path / "plate.npz", tmp_path / "masks.npz")
-    assert masks.meta["status"] == reason and masks.frames() == []
+    assert masks.meta["cameras"] == {"cam01": reason} and masks.frames() == []
     with ArchiveWriter(files["pair"], {"left": "cam01", "right": "cam02", "status": "ok"}):
         pass
     plate = run_plate(files, tmp_path / "plate.npz")
     assert plate.meta["status"] == "stereo suffices: 1 of 1 pairs are matched"
+
+
+def test_a_camera_that_moves_has_no_plate_unless_asked_for(tmp_path: Path) -> None:
+    """What never leaves its place in turned pictures would be taken for background and carve the hull."""
+    files = write_event(tmp_path, num_frames=4)
+    document = read_json(files["cameras"])
+    frames = document["cameras"]["cam01"]["frames"]
+    turned = [cv2.Rodrigues(np.array([0.0, 0.01 * i, 0.0]))[0].tolist() for i in range(4)]
+    document["cameras"]["cam01"]["frames"] = [{**frames[0], "R": R} for R in turned]
+    write_json(files["cameras"], document)
+    assert run_plate(files, tmp_path / "plate.npz").meta["status"] == "no background: the camera moves"
+    asked = run_plate(files, tmp_path / "plate.npz", "--use", "always")
+    assert (asked.meta["status"], asked.frames()) == ("ok", [0, 1, 2, 3])
