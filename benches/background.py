@@ -8,7 +8,8 @@ pictures in heldout/VIEW or ../frames/VIEW. Scored are static pixels inside the 
 point at least two input cameras have in their picture.
 
 A mover that stands still is made by sampling one frame several times: what it hides then is hidden for
-that share of the clip. Writes background_error.csv, background_still.csv and pictures.
+that share of the clip. Writes background_error.csv, background_still.csv, background_pareto.png (RMS error
+over all views against processor seconds a pose) and pictures.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from benches.pareto import plot_front
 from fourd import io
 from fourd.background.__main__ import read_samples, spread
 from fourd.background.estimate import Samples, estimate_backgrounds
@@ -172,6 +174,21 @@ def measure_settings(
     return rows
 
 
+def average_settings(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One row per setting: RMS error in grey levels and processor seconds a pose, over all frames."""
+    settings: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        settings.setdefault(f"{row['setting']} {row['value']}".strip(), []).append(row)
+    return [
+        {
+            "name": name,
+            "rms_error": 255 * np.sqrt(np.mean([10 ** (-float(row["error"]) / 10) for row in found])),
+            "cpu_seconds": np.mean([float(row["cpu_seconds"]) for row in found]),
+        }
+        for name, found in settings.items()
+    ]
+
+
 def measure_still(truths: Sequence[Truth], samples: Samples, labels: Path) -> list[dict[str, Any]]:
     """Ghosts where a mover of the middle sample hides the background for a growing share of the clip."""
     middle = len(samples.frames) // 2
@@ -226,6 +243,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             labels = find_folder([args.truth / "labels"], view)
             still += measure_still(truths, samples_of(NUM_STILL), labels)
     io.write_csv(args.output / "background_error.csv", COLUMNS, rows)
+    averages = average_settings(rows)
+    plot_front(args.output / "background_pareto.png", averages, "name", "default", error="rms_error")
     io.write_csv(args.output / "background_still.csv", STILL_COLUMNS, still)
 
 
