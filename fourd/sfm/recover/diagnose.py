@@ -7,11 +7,11 @@ import pycolmap
 
 from fourd.camera import Camera
 from fourd.geometry import angle_deg
+from fourd.sfm.recover.features import Features, find_features
 from fourd.sfm.recover.films import Film
-from fourd.sfm.recover.mapping import Features, VerifiedPair, verify_pair
+from fourd.sfm.recover.mapping import VerifiedPair, verify_pair
 from fourd.sfm.recover.model import ImageKey, Lens, Model
 from fourd.sfm.recover.options import RecoverOptions
-from fourd.sfm.sparse import detect_features
 
 MIN_CONTRAST = 3.0
 MIN_FEATURES = 100
@@ -81,7 +81,7 @@ def _matches_mirrored(
 ) -> bool:
     """Whether the film's middle keyframe, flipped left to right, matches a placed camera."""
     key = own[len(own) // 2]
-    flipped = Features(*detect_features(film.read_rgb(key[1])[:, ::-1].copy(), options.max_features))
+    flipped = find_features(film.read_rgb(key[1])[:, ::-1].copy(), options)
     others = [k for k in sorted(features) if k[0] in placed]
     trial = {**features, key: flipped}
     return any(verify_pair(key, other, trial, lenses, options) is not None for other in others)

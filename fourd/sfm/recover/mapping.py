@@ -9,21 +9,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from fourd.sfm.recover.features import Features, match_features
 from fourd.sfm.recover.model import HALF_PIXEL, ImageKey, Lens, Model, lens_ids
 from fourd.sfm.recover.options import RecoverOptions
-from fourd.sfm.sparse import match_descriptors
 
 SEED = 1
 # Keyframes of one film overlap much more than those of two cameras; this many neighbours link them.
 NUM_FILM_NEIGHBORS = 2
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Features:
-    """pixels: (N, 2) float64 px;  descriptors: (N, 128) float32 whole numbers"""
-
-    pixels: np.ndarray
-    descriptors: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,7 +44,7 @@ def verify_pair(
 ) -> VerifiedPair | None:
     """The pair with its inliers, None below `min_matches` of them."""
     a, b = features[left], features[right]
-    matches = match_descriptors(a.descriptors, b.descriptors, options.match_ratio)
+    matches = match_features(a, b, (lenses[left[0]].size, lenses[right[0]].size), options)
     if len(matches) < options.min_matches:
         return None
     estimation = pycolmap.TwoViewGeometryOptions()

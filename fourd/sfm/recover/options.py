@@ -8,6 +8,8 @@ class RecoverOptions:
     """Options of the recovery of cameras from films."""
 
     num_keyframes: int = 4
+    features: str = "sift"
+    learned_weights: str = ""
     max_features: int = 4000
     match_ratio: float = 0.8
     max_match_error_px: float = 3.0

@@ -25,6 +25,7 @@ from fourd.sfm.recover.evidence import (
     rms_px,
     sub_model,
 )
+from fourd.sfm.recover.features import Features, find_features
 from fourd.sfm.recover.films import Film, gray_reader
 from fourd.sfm.recover.frames import (
     adjust_films,
@@ -32,12 +33,11 @@ from fourd.sfm.recover.frames import (
     longest_run,
     track_films,
 )
-from fourd.sfm.recover.mapping import Features, VerifiedPair, map_keyframes, match_keyframes
+from fourd.sfm.recover.mapping import VerifiedPair, map_keyframes, match_keyframes
 from fourd.sfm.recover.model import ImageKey, Lens, Model
 from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.recover.register import describe_landmarks, register_film, register_remaining
 from fourd.sfm.recover.tracking import Landmarks, cut_landmarks, observe, refine_pose
-from fourd.sfm.sparse import detect_features
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ def recover_cameras(
 
 def _detect(films: Mapping[str, Film], options: RecoverOptions) -> dict[ImageKey, Features]:
     return {
-        (name, frame): Features(*detect_features(film.read_rgb(frame), options.max_features))
+        (name, frame): find_features(film.read_rgb(frame), options)
         for name, film in films.items()
         for frame in film.keyframes(options.num_keyframes)
     }

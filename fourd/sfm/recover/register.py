@@ -8,12 +8,11 @@ from scipy.spatial import KDTree
 
 from fourd.sfm.recover.adjust import adjust
 from fourd.sfm.recover.evidence import choose_lens
+from fourd.sfm.recover.features import Features, match_features
 from fourd.sfm.recover.films import Film
-from fourd.sfm.recover.mapping import Features
 from fourd.sfm.recover.model import ImageKey, Lens, Model
 from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.recover.tracking import Landmarks, estimate_pose, observe
-from fourd.sfm.sparse import match_descriptors
 
 # A landmark and a feature this close in a picture are the same corner.
 SAME_CORNER_PX = 1.0
@@ -21,24 +20,29 @@ SAME_CORNER_PX = 1.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DescribedLandmarks:
-    """descriptors: (N, 128) and landmark: (N,) of the features of one keyframe that are landmarks."""
+    """Those of one keyframe's features that are landmarks.
 
-    descriptors: np.ndarray
+    size: (width, height) px of the keyframe;  landmark: (N,) number of each feature
+    """
+
+    features: Features
+    size: tuple[int, int]
     landmark: np.ndarray
 
 
 def describe_landmarks(model: Model, features: Mapping[ImageKey, Features]) -> list[DescribedLandmarks]:
-    """Descriptors of the model's landmarks, one entry per keyframe."""
+    """Features of the model's landmarks, one entry per keyframe."""
     described = []
     for i, image in enumerate(model.images):
         rows = np.flatnonzero(model.obs_image == i)
         if image not in features or len(rows) == 0:
             continue
-        distance, nearest = KDTree(features[image].pixels).query(model.obs_px[rows])
-        near, nearest = distance <= SAME_CORNER_PX, np.asarray(nearest)
-        described.append(
-            DescribedLandmarks(features[image].descriptors[nearest[near]], model.obs_point[rows[near]])
-        )
+        own = features[image]
+        distance, nearest = KDTree(own.pixels).query(model.obs_px[rows])
+        near = distance <= SAME_CORNER_PX
+        chosen = np.asarray(nearest)[near]
+        seen = Features(own.pixels[chosen], own.descriptors[chosen])
+        described.append(DescribedLandmarks(seen, model.lenses[image[0]].size, model.obs_point[rows[near]]))
     return described
 
 
@@ -52,7 +56,7 @@ def register_keyframe(
     """Pose (3, 4) and lens of a picture from its matches with the landmarks; None if it has too few."""
     pairs = [np.zeros((0, 2), dtype=np.int64)]
     for view in described:
-        matches = match_descriptors(features.descriptors, view.descriptors, options.match_ratio)
+        matches = match_features(features, view.features, (lens.size, view.size), options)
         pairs.append(np.stack([matches[:, 0], view.landmark[matches[:, 1]]], axis=1))
     unique = np.unique(np.concatenate(pairs), axis=0)
     pixels, seen = features.pixels[unique[:, 0]], points[unique[:, 1]]
