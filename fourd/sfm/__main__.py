@@ -32,7 +32,7 @@ from fourd.sfm.assemble import (
 )
 from fourd.sfm.depth_range import DepthRange, choose_depth_ranges
 from fourd.sfm.importers import FORMATS, ImportedCameras, read_calibration
-from fourd.sfm.normalize import estimate_similarity, estimate_up, sample_cameras
+from fourd.sfm.normalize import estimate_similarity, estimate_up, sample_cameras, snap_center
 from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.sparse import find_sparse_points, sparse_frames
 
@@ -88,7 +88,9 @@ def run_import(
     selected = select_cameras(imported, names_in_file, inputs, ingested, num_frames)
     samples = sample_cameras({name: selected.tracks[name] for name in inputs})
     similarity = estimate_similarity(samples)
-    tracks = {name: [similarity.apply(c) for c in cameras] for name, cameras in selected.tracks.items()}
+    tracks = {
+        name: [snap_center(similarity.apply(c)) for c in cameras] for name, cameras in selected.tracks.items()
+    }
     points = similarity.world_from_source(selected.points)
     has_bounds = depth_range is not None or all(name in selected.bounds for name in tracks)
     if len(points) == 0 and not has_bounds:

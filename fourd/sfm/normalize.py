@@ -52,9 +52,14 @@ class Similarity:
         """The same camera in the normalised world, its R made exactly orthonormal."""
         # solve, not R.T: the centre is the null vector of [R | t] even when R is rounded.
         center = self.world_from_source(np.linalg.solve(camera.R, -camera.t))
-        center = np.round(center / CENTER_STEP) * CENTER_STEP
         R = nearest_rotation(camera.R)
         return dataclasses.replace(camera, R=R, t=-R @ center)
+
+
+def snap_center(camera: Camera) -> Camera:
+    """The camera with its centre on the grid of `CENTER_STEP`, moved by at most half a step per axis."""
+    center = np.round(camera.center / CENTER_STEP) * CENTER_STEP
+    return dataclasses.replace(camera, t=-camera.R @ center)
 
 
 def estimate_similarity(cameras: Sequence[Camera]) -> Similarity:

@@ -69,8 +69,17 @@ def test_unprojected_pixels_project_onto_themselves(camera, places):
     np.testing.assert_allclose(found_depth, depth, rtol=1e-11)
 
 
+def reach(lens):
+    """Largest distorted radius at z = 1 that a ray reaches before the radial polynomial turns back."""
+    radius = np.linspace(0, 10, 100_001)
+    distorted = radius * (1 + lens[0] * radius**2 + lens[1] * radius**4)
+    turning = np.flatnonzero(np.diff(distorted) <= 0)
+    return distorted[turning[0]] if turning.size else np.inf
+
+
 @given(cameras, places, st.floats(-0.3, 0.15), st.floats(-0.05, 0.05))
 def test_any_lens_that_is_accepted_is_undone(camera, places, k1, k2):
+    """Wherever a ray exists: corners of an accepted lens may lie beyond where it turns back."""
     camera = dataclasses.replace(camera, distortion=np.array([k1, k2, 1e-3, -1e-3, 0.0]))
     try:
         check_camera(camera, "camera")
@@ -78,8 +87,11 @@ def test_any_lens_that_is_accepted_is_undone(camera, places, k1, k2):
         assume(False)
     x, y, depth = np.array(places).T
     pixels = np.stack([x * (camera.size[0] - 1), y * (camera.size[1] - 1)], axis=1)
+    distorted = camera.without_distortion().rays(pixels)[:, :2]
+    # Five percent short of the turn, where the tangential terms do not matter.
+    has_ray = np.linalg.norm(distorted, axis=1) < 0.95 * reach(camera.distortion)
     found, _ = camera.project(camera.unproject(pixels, depth))
-    np.testing.assert_allclose(found, pixels, atol=1e-6)
+    np.testing.assert_allclose(found[has_ray], pixels[has_ray], atol=1e-6)
 
 
 @pytest.mark.parametrize("k1", [-0.9, -3.0])

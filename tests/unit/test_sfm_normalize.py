@@ -7,11 +7,15 @@ from hypothesis import strategies as st
 
 from fourd.camera import Camera
 from fourd.errors import InputError
-from fourd.sfm.normalize import CENTER_STEP, Similarity, estimate_similarity, estimate_up, sample_cameras
+from fourd.sfm.normalize import (
+    CENTER_STEP,
+    Similarity,
+    estimate_similarity,
+    estimate_up,
+    sample_cameras,
+    snap_center,
+)
 from tests.unit.sfm_rig import POINTS, SIZE, TARGET, make_rig, moved_rig, transform_world
-
-# Positions are kept on a grid: by how much one may be moved, in each coordinate.
-HALF_STEP = CENTER_STEP / 2
 
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 
@@ -48,8 +52,7 @@ def test_convention_source_is_world_times_scale_plus_origin(exponent, shift):
     similarity = estimate_similarity(cameras)
     for camera in cameras:
         source = similarity.apply(camera).center * similarity.scale + similarity.origin
-        rounding = 1e-14 * (10.0**exponent * 10 + 200)
-        np.testing.assert_allclose(source, camera.center, atol=rounding + HALF_STEP * similarity.scale)
+        np.testing.assert_allclose(source, camera.center, atol=1e-14 * (10.0**exponent * 10 + 200))
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e3, -1e7])
@@ -59,9 +62,16 @@ def test_last_digits_of_the_source_do_not_show(shift):
         list(make_rig().values()),
         [transform_world(c, 1.0, np.full(3, shift)) for c in make_rig().values()],
     ]
-    found = [[estimate_similarity(rig).apply(camera).center for camera in rig] for rig in rigs]
+    found = [[snap_center(estimate_similarity(rig).apply(camera)).center for camera in rig] for rig in rigs]
     steps = np.abs(np.array(found[0]) - np.array(found[1])) / CENTER_STEP
     assert (steps < 0.5).mean() > 0.9 and steps.max() < 1.5
+
+
+def test_centre_moves_by_at_most_half_a_step_and_only_once():
+    for camera in make_rig().values():
+        snapped = snap_center(camera)
+        np.testing.assert_allclose(snapped.center, camera.center, atol=CENTER_STEP / 2 * (1 + 1e-9), rtol=0)
+        np.testing.assert_array_equal(snap_center(snapped).t, snapped.t)
 
 
 def test_positions_without_digits_to_tell_them_apart_are_refused():
@@ -77,9 +87,8 @@ def test_images_are_unchanged():
     for camera in cameras:
         pixels, depth = similarity.apply(camera).project(points)
         expected, source_depth = camera.project(POINTS)
-        step_px = 2 * HALF_STEP * camera.focal_px / depth.min()
-        np.testing.assert_allclose(pixels, expected, atol=1e-9 + step_px)
-        np.testing.assert_allclose(depth, source_depth / similarity.scale, atol=2 * HALF_STEP)
+        np.testing.assert_allclose(pixels, expected, atol=1e-9)
+        np.testing.assert_allclose(depth * similarity.scale, source_depth)
 
 
 def test_converging_cameras_surround_the_origin_at_distance_one():
@@ -133,7 +142,7 @@ def test_rounded_rotations_become_orthonormal_and_keep_the_centre():
     rounded = dataclasses.replace(camera, R=camera.R.round(5))
     exact = Similarity(np.zeros(3), 1.0, True).apply(rounded)
     np.testing.assert_allclose(exact.R @ exact.R.T, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(exact.center, np.linalg.solve(rounded.R, -rounded.t), atol=1.01 * HALF_STEP)
+    np.testing.assert_allclose(exact.R @ np.linalg.solve(rounded.R, -rounded.t) + exact.t, 0, atol=1e-12)
 
 
 def test_samples_weigh_still_and_moving_cameras_alike():

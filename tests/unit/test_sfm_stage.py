@@ -31,9 +31,6 @@ from tests.unit.sfm_rig import (
 )
 from tests.unit.test_sfm_colmap import write_colmap
 
-# What the grid of positions moves in a picture of these rigs, px.
-STEP_PX = 500 * CENTER_STEP
-
 SCHEMA_PATH = Path(__file__).resolve().parents[2] / "config" / "schemas" / "sfm.schema.yaml"
 
 
@@ -71,20 +68,27 @@ def test_options_and_schema_agree():
     assert all(len(entry["description"]) > 20 for entry in schema["properties"].values())
 
 
+def project_from_exact_centre(scene, name, frame, source):
+    """Pixels of POINTS in a camera of the scene, moved by the half step or less to its centre in the source."""
+    camera = scene.tracks[name].at(frame)
+    center = (source.center - scene.origin) / scene.scale
+    np.testing.assert_allclose(camera.center, center, atol=0.5001 * CENTER_STEP)
+    exact = dataclasses.replace(camera, t=-camera.R @ center)
+    return exact.project((POINTS - scene.origin) / scene.scale)[0]
+
+
 def test_native_import_keeps_the_images(tmp_path):
     rig = moved_rig(3)
     scene = import_native(tmp_path, rig, ["cam02"], 3, ["--depth-range", "2", "none"])
     assert (scene.fps, scene.num_frames) == (30, 3)
     assert (scene.inputs, scene.heldout) == (("cam00", "cam01", "cam03"), ("cam02",))
-    world = (POINTS - scene.origin) / scene.scale
     for name, track in rig.items():
         assert scene.tracks[name].near == pytest.approx(2 / scene.scale)
         assert scene.tracks[name].far == float("inf")
         assert scene.depth_range_from[name] == "given"
         for frame, camera in enumerate(track):
-            np.testing.assert_allclose(
-                scene.tracks[name].at(frame).project(world)[0], camera.project(POINTS)[0], atol=STEP_PX
-            )
+            pixels = project_from_exact_centre(scene, name, frame, camera)
+            np.testing.assert_allclose(pixels, camera.project(POINTS)[0])
     assert Archive(tmp_path / "sfm" / "points.npz")["points"].shape == (0, 3)
     assert json.loads((tmp_path / "sfm" / "cameras.json").read_text())["cameras"]["cam00"]["far"] is None
 
@@ -139,9 +143,9 @@ def test_smaller_copies_of_the_images_rescale_K(tmp_path):
         write_ingest(tmp_path, name, size=half)
     main(import_arguments(tmp_path, path, list(rig), extra=["--depth-range", "1", "9"]))
     scene = read_cameras(tmp_path / "sfm" / "cameras.json")
-    pixels = scene.tracks["cam00"].at(0).project((POINTS - scene.origin) / scene.scale)[0]
+    pixels = project_from_exact_centre(scene, "cam00", 0, rig["cam00"])
     assert scene.tracks["cam00"].size == half
-    np.testing.assert_allclose((pixels + 0.5) * 2 - 0.5, rig["cam00"].project(POINTS)[0], atol=STEP_PX)
+    np.testing.assert_allclose((pixels + 0.5) * 2 - 0.5, rig["cam00"].project(POINTS)[0])
 
 
 def test_colmap_points_give_near_and_heldout_observations_do_not_count(tmp_path):
