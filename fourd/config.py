@@ -91,6 +91,25 @@ def read_words(value: Any, schema: Mapping[str, Any]) -> Any:
     return value
 
 
+def expand_presets(document: Mapping[str, Any], schema: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """A copy in which a section given by the name of a preset holds all of its keys.
+
+    All keys, so that what a scene sets for the section does not mix with the preset.
+    Raises InputError for a name that the section does not know.
+    """
+    expanded = dict(document)
+    for section, value in document.items():
+        presets = schema["properties"].get(section, {}).get("presets", {})
+        if not isinstance(value, str) or not presets:
+            continue
+        if value not in presets:
+            raise InputError(
+                f"{where}: {section} is {value!r}, expected a mapping of keys or one of {', '.join(presets)}"
+            )
+        expanded[section] = fill_defaults(dict(presets[value]), schema["properties"][section])
+    return expanded
+
+
 def _explain(error: jsonschema.ValidationError, where: str) -> str:
     key = ".".join(str(part) for part in error.absolute_path) or "the file"
     rule: Any = error.validator_value
@@ -248,7 +267,8 @@ def _check_scene(scene: Scene, where: str) -> None:
 def load_config(given: Mapping[str, Any], scene_settings: Mapping[str, Any], scene: str) -> dict[str, Any]:
     """The full configuration: schema defaults, below the scene's settings, below what was given."""
     schema = load_config_schema()
-    given = read_words(given, schema)
+    given = expand_presets(read_words(given, schema), schema, "configuration")
+    scene_settings = expand_presets(scene_settings, schema, f"scene {scene}, settings")
     validate(given, schema, "configuration")
     validate(scene_settings, schema, f"scene {scene}, settings")
     return fill_defaults(merge(scene_settings, given), schema)

@@ -199,7 +199,7 @@ def scene_text(name: str, draft: SceneDraft) -> str:
         "# A network that two cores train in minutes; with a GPU take it out",
         "settings:",
         *few_cameras,
-        "  composition: {num_filters: [8, 8, 8], crop: 192, epochs: 6, test_input_share: 0.75}",
+        "  composition: {num_filters: [8, 8, 8], crop: 192, epochs: 6}",
     ]
     return "\n".join(lines) + "\n"
 

@@ -22,7 +22,7 @@ from fourd.errors import InputError
 from fourd.io import Archive, atomic_folder, read_image, write_csv, write_png
 from fourd.views import read_view
 
-STAGE_VERSION = 1
+STAGE_VERSION = 2
 HOLES_COLUMNS = ("frame", "level", "hole_share", "largest_hole_share", "filled_share", "reason")
 PROGRESS_INTERVAL_S = 2.0
 
@@ -94,7 +94,7 @@ def run_frames(
     Raises InputError if a file is missing, broken, or is of another view or size.
     """
     # Torch takes seconds to import, and a film is encoded without it.
-    from fourd.composition.infer import compose_frame, load_models
+    from fourd.composition.infer import compose_frame, estimates_read, load_models
 
     view = read_view(view_path)
     frames = view.frames_of(frames)
@@ -106,13 +106,14 @@ def run_frames(
         contextlib.closing(Archive(background_path)) as background,
     ):
         _check_same_view(view.name, (foreground, background))
-        backgrounds = BackgroundReader(background, ("farthest_rgb", "farthest_valid"))
+        backgrounds = BackgroundReader(background, estimates_read(models, "background"))
+        keys = estimates_read(models, "foreground")
         rows = []
         with atomic_folder(output) as folder:
             for frame in with_progress(frames, f"render {view.name}"):
-                consensus = read_arrays(foreground, frame, ("consensus_rgb", "consensus_valid"))
-                _check_size(view.size, consensus["consensus_rgb"], foreground_path)
-                image, levels = compose_frame(models, frame, consensus, backgrounds.read(frame), options)
+                estimates = read_arrays(foreground, frame, keys)
+                _check_size(view.size, estimates["consensus_rgb"], foreground_path)
+                image, levels = compose_frame(models, frame, estimates, backgrounds.read(frame), options)
                 write_png(folder / f"{frame:06d}.png", image)
                 rows.extend(levels)
             write_csv(folder / "holes.csv", HOLES_COLUMNS, rows)

@@ -153,8 +153,8 @@ def empty_scene_flags(wildcards):
 
 
 def estimates_of_view(wildcards):
-    """Films need the consensus only; physical cameras are trained on and scored with all four."""
-    if wildcards.view in TRAJECTORIES:
+    """Physical cameras are trained on and scored with all four; films may need the consensus only."""
+    if wildcards.view in TRAJECTORIES and config["composition"]["streams"] == "paper":
         return "consensus"
     return "consensus closest median farthest"
 

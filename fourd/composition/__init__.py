@@ -6,7 +6,7 @@ it to a scene, `infer` its use: one frame through the levels, coarse to fine.
 
 import dataclasses
 
-STAGE_VERSION = 1
+STAGE_VERSION = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,7 +17,7 @@ class CompositionOptions:
     unet_width: int = 1
     depth: int = 4
     head: str = "blend"
-    test_input_share: float = 0.5
+    streams: str = "all"
     l1_weight: float = 100.0
     adversarial_weight: float = 1.0
     frequency_weight: float = 100.0

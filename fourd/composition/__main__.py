@@ -15,7 +15,7 @@ from fourd import cli, io
 from fourd.composition import STAGE_VERSION, CompositionOptions, data
 from fourd.composition.checkpoint import Checkpoint, StopRequest, save_torch
 from fourd.composition.forecast import check_memory
-from fourd.composition.model import HEADS, resolve_precision
+from fourd.composition.model import HEADS, TEST_STREAMS, resolve_precision
 from fourd.composition.train import COLUMNS, Trainer, train
 from fourd.errors import InputError
 from fourd.image import undistort
@@ -153,8 +153,8 @@ def check_options(options: CompositionOptions) -> None:
         raise InputError(
             f"expected max_scale of at least 1, got {options.max_scale}: inputs are only enlarged"
         )
-    if not 0 <= options.test_input_share <= 1:
-        raise InputError(f"expected test_input_share in 0..1, got {options.test_input_share}")
+    if options.streams not in TEST_STREAMS:
+        raise InputError(f"expected streams to be one of {', '.join(TEST_STREAMS)}, got {options.streams!r}")
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -30,12 +30,11 @@ ESTIMATES = (
     ("foreground", "farthest"),
 )
 TRAINING_STREAMS = (0, 1, 2, 3, 4, 5)
-TEST_STREAMS = (0, 0, 0, 3, 3, 3)
 TARGET = 6
 MIN_VALID_SHARE = 0.5
 MAX_OPEN_ARCHIVES = 32
 # First entries of the seeds of what is drawn, so that order and crops are independent.
-_ORDER, _AUGMENTATION, _STREAMS = 0, 1, 2
+_ORDER, _AUGMENTATION = 0, 1
 
 ReadTarget = Callable[[str, int], tuple[np.ndarray, np.ndarray]]
 
@@ -99,12 +98,6 @@ def target_from_images(images: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
 def sample_order(num_samples: int, epoch: int, seed: int) -> list[int]:
     """Permutation of the samples in an epoch; a function of its arguments alone."""
     return np.random.default_rng([_ORDER, seed, epoch]).permutation(num_samples).tolist()
-
-
-def draw_streams(test_input_share: float, seed: int, step: int) -> tuple[int, ...]:
-    """Which image feeds each stream at a step: in that share of the steps the test-time ones."""
-    is_test = np.random.default_rng([_STREAMS, seed, step]).uniform() < test_input_share
-    return TEST_STREAMS if is_test else TRAINING_STREAMS
 
 
 def augment(images: np.ndarray, crop: int | None, max_scale: float, seed: int, step: int) -> np.ndarray:

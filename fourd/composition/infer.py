@@ -16,16 +16,16 @@ from fourd.composition import CascadeOptions
 from fourd.composition.checkpoint import read_torch
 from fourd.composition.data import (
     ESTIMATES,
-    TEST_STREAMS,
     reduce_image,
     reduction_factor,
     streams_from_images,
 )
-from fourd.composition.model import CompositionNet, resolve_precision
+from fourd.composition.model import TEST_STREAMS, CompositionNet, resolve_precision
 from fourd.composition.model import paste as paste_streams
 from fourd.errors import InputError
 from fourd.image import uint8_from_float
 
+CONSENSUS, STATIC = 0, 3
 MODEL_KEYS = ("level", "num_levels", "network", "state_dict")
 
 Arrays = Mapping[str, np.ndarray]
@@ -59,11 +59,11 @@ def _network(document: Mapping[str, Any], device: str) -> CompositionNet:
 def run_network(network: CompositionNet, images: np.ndarray, precision: str = "auto") -> np.ndarray:
     """(H, W, 3) uint8 composed from test-time inputs.
 
-    images: (N, H, W, 4) uint8 RGBA, N > 3; consensus at 0 and static background at 3 are read
+    images: (N, H, W, 4) uint8 RGBA in the order of `ESTIMATES`; those of `network.test_streams` are read
     precision: of `resolve_precision`
     """
     device = next(network.parameters()).device
-    streams = streams_from_images(images, TEST_STREAMS).to(device)
+    streams = streams_from_images(images, network.test_streams).to(device)
     with torch.inference_mode():
         output = network(streams, resolve_precision(precision, device.type))
     return _image(output)
@@ -74,14 +74,21 @@ def paste_images(images: np.ndarray) -> np.ndarray:
 
     images: as for `run_network`
     """
-    image, filled = paste_streams(streams_from_images(images, TEST_STREAMS))
+    image, filled = paste_streams(streams_from_images(images, TEST_STREAMS["paper"]))
     mean = image.sum(dim=(2, 3), keepdim=True) / filled.sum(dim=(2, 3), keepdim=True).clamp(min=1)
     return _image(torch.where(filled > 0, image, mean))
 
 
 def paste(foreground: Arrays, background: Arrays) -> np.ndarray:
     """The baseline without a network, (H, W, 3) uint8; arguments as for `compose_frame`."""
-    return paste_images(_stack(foreground, background, 1))
+    return paste_images(_stack(foreground, background, TEST_STREAMS["paper"], 1))
+
+
+def estimates_read(models: Sequence[CompositionNet], kind: str) -> list[str]:
+    """Names of the arrays that `compose_frame` reads of a `foreground` or `background`."""
+    indices = {index for model in models for index in (*model.test_streams, CONSENSUS, STATIC)}
+    names = [ESTIMATES[index][1] for index in sorted(indices) if ESTIMATES[index][0] == kind]
+    return [f"{name}_{part}" for name in names for part in ("rgb", "valid")]
 
 
 def compose_frame(
@@ -95,18 +102,19 @@ def compose_frame(
 
     models:     of `load_models`, coarsest first
     frame:      output frame, for the report only
-    foreground: arrays of one frame of a foreground archive; `consensus_*` are read
-    background: arrays of one (resolved) frame of a background archive; `farthest_*` are read
+    foreground: arrays of one frame of a foreground archive, see `estimates_read`
+    background: arrays of one (resolved) frame of a background archive
     Returns (H, W, 3) uint8 and a row per level that ran: `frame`, `level`, `hole_share` and
     `largest_hole_share` of its inputs, `filled_share` (0 or hole_share), `reason`.
     """
     options = options or CascadeOptions()
     num_levels = len(models)
     level = num_levels - 1
-    inputs = {level: _stack(foreground, background, 1)}
+    inputs = {level: _stack(foreground, background, models[level].test_streams, 1)}
     while level > 0 and holes_are_large(find_holes(inputs[level]), options):
         level -= 1
-        inputs[level] = _stack(foreground, background, reduction_factor(level, num_levels))
+        factor = reduction_factor(level, num_levels)
+        inputs[level] = _stack(foreground, background, models[level].test_streams, factor)
     rows: list[dict[str, Any]] = []
     image: np.ndarray | None = None
     for level in sorted(inputs):
@@ -120,8 +128,8 @@ def compose_frame(
 
 
 def find_holes(images: np.ndarray) -> np.ndarray:
-    """(H, W) bool: neither consensus nor static background is valid."""
-    return (images[TEST_STREAMS[0], ..., 3] == 0) & (images[TEST_STREAMS[-1], ..., 3] == 0)
+    """(H, W) bool: no estimate is valid."""
+    return (images[..., 3] == 0).all(axis=0)
 
 
 def hole_shares(holes: np.ndarray) -> tuple[float, float]:
@@ -144,7 +152,7 @@ def fill_holes(images: np.ndarray, holes: np.ndarray, coarser: np.ndarray) -> No
     """
     height, width = coarser.shape[:2]
     finer = cv2.resize(coarser, (2 * width, 2 * height), interpolation=cv2.INTER_LINEAR)
-    background = images[TEST_STREAMS[-1]]
+    background = images[STATIC]
     background[holes, :3] = finer[: holes.shape[0], : holes.shape[1]][holes]
     background[holes, 3] = 255
 
@@ -169,15 +177,15 @@ def _describe(
     }
 
 
-def _stack(foreground: Arrays, background: Arrays, factor: int) -> np.ndarray:
-    """(4, H, W, 4) uint8 with consensus at 0 and static background at 3; the others are blank."""
+def _stack(foreground: Arrays, background: Arrays, order: Sequence[int], factor: int) -> np.ndarray:
+    """(6, H, W, 4) uint8 in the order of `ESTIMATES`; those that are not in `order` are blank."""
     arrays = {"foreground": foreground, "background": background}
     images: np.ndarray | None = None
-    for index in sorted(set(TEST_STREAMS)):
+    for index in sorted(set(order)):
         kind, key = ESTIMATES[index]
         image = reduce_image(arrays[kind][f"{key}_rgb"], arrays[kind][f"{key}_valid"], factor)
         if images is None:
-            images = np.zeros((max(TEST_STREAMS) + 1, *image.shape), np.uint8)
+            images = np.zeros((len(ESTIMATES), *image.shape), np.uint8)
         if image.shape != images.shape[1:]:
             raise InputError(
                 f"expected foreground and background of one size, got {images.shape[1:3]} and "

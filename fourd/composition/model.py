@@ -13,6 +13,9 @@ NUM_FOREGROUND = 3
 NUM_STREAMS = 6
 STREAM_CHANNELS = 4
 HEADS = ("blend", "direct")
+# Which estimate feeds each stream at test: all six, as in training; or only the consensus and the static
+# background (the paper, section 4).
+TEST_STREAMS = {"all": (0, 1, 2, 3, 4, 5), "paper": (0, 0, 0, 3, 3, 3)}
 PRECISIONS = ("float32", "bfloat16")
 # Where several estimates are valid the first of this order is pasted: consensus, static
 # background, then what only training sees.
@@ -110,13 +113,16 @@ class CompositionNet(nn.Module):
     head:        `direct`, three convolutions give the image (the paper); or `blend`, they give
                  weights over the six inputs and an additive correction
     level:       0 is the coarsest; it sets the padding
+    streams:     of `TEST_STREAMS`; `test_streams` says which estimates it is to be given at test
     """
 
-    def __init__(self, num_filters: int, unet_width: int, depth: int, head: str, level: int) -> None:
+    def __init__(
+        self, num_filters: int, unet_width: int, depth: int, head: str, level: int, streams: str = "all"
+    ) -> None:
         super().__init__()
         if head not in HEADS:
             raise ValueError(f"head must be one of {HEADS}, got {head!r}")
-        self.level, self.head = level, head
+        self.level, self.head, self.test_streams = level, head, TEST_STREAMS[streams]
         stream = [STREAM_CHANNELS] + [num_filters] * 3
         width = unet_width * num_filters
         self.streams = nn.ModuleList(convolutions(stream) for _ in range(NUM_STREAMS))

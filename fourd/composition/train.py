@@ -38,6 +38,7 @@ class Trainer:
             "depth": options.depth,
             "head": options.head,
             "level": level,
+            "streams": options.streams,
         }
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(options.seed)
@@ -138,8 +139,7 @@ def train(
         epoch, position = divmod(step, len(training))
         sample = training[data.sample_order(len(training), epoch, options.seed)[position]]
         images = data.augment(samples.images(sample), options.crop, options.max_scale, options.seed, step)
-        order = data.draw_streams(options.test_input_share, options.seed, step)
-        streams = data.streams_from_images(images, order).to(device)
+        streams = data.streams_from_images(images, data.TRAINING_STREAMS).to(device)
         target, valid = (tensor.to(device) for tensor in data.target_from_images(images))
 
         result = update(trainer, streams, target, valid, options)

@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fourd.composition import data
+from fourd.composition.model import TEST_STREAMS
 from fourd.errors import InputError
 from fourd.io import ArchiveWriter
 
@@ -85,10 +86,14 @@ def test_order_is_a_permutation_that_depends_on_seed_and_epoch_only():
 
 
 def test_streams_are_the_papers_in_training_and_consensus_and_background_at_test():
-    assert data.draw_streams(0.0, 0, 3) == (0, 1, 2, 3, 4, 5)
-    assert data.draw_streams(1.0, 0, 3) == (0, 0, 0, 3, 3, 3)
-    draws = [data.draw_streams(0.5, 0, step) == data.TEST_STREAMS for step in range(400)]
-    assert 160 < sum(draws) < 240
+    assert [data.ESTIMATES[i] for i in data.TRAINING_STREAMS] == [
+        *(("foreground", name) for name in ("consensus", "closest", "median")),
+        *(("background", name) for name in ("farthest", "median")),
+        ("foreground", "farthest"),
+    ]
+    names = [data.ESTIMATES[i] for i in TEST_STREAMS["paper"]]
+    assert names == 3 * [("foreground", "consensus")] + 3 * [("background", "farthest")]
+    assert TEST_STREAMS["all"] == data.TRAINING_STREAMS
 
 
 def test_augmentation_is_a_function_of_seed_and_step():

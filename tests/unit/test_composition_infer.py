@@ -8,14 +8,14 @@ from fourd.composition.model import CompositionNet
 from fourd.errors import InputError
 
 HEIGHT, WIDTH = 48, 64
-ARGUMENTS = {"num_filters": 2, "unet_width": 1, "depth": 1, "head": "blend"}
+ARGUMENTS = {"num_filters": 2, "unet_width": 1, "depth": 1, "head": "blend", "streams": "paper"}
 
 
-def write_models(folder, num_levels, seed=0):
+def write_models(folder, num_levels, seed=0, streams="paper"):
     torch.manual_seed(seed)
     paths = []
     for level in range(num_levels):
-        arguments = ARGUMENTS | {"level": level}
+        arguments = ARGUMENTS | {"level": level, "streams": streams}
         network = CompositionNet(**arguments)
         document = {"level": level, "num_levels": num_levels, "network": arguments}
         paths.append(folder / f"{level}.pt")
@@ -53,6 +53,30 @@ def test_untrained_blend_equals_the_paste_in_every_grey_level(tmp_path):
     assert [row["level"] for row in rows] == [0]
     assert rows[0]["frame"] == 7
     assert rows[0]["hole_share"] == pytest.approx(36 / (HEIGHT * WIDTH))
+
+
+def test_all_streams_fill_what_consensus_and_background_leave_blank(tmp_path):
+    """An untrained blend pastes, so each pixel tells which estimate it is from."""
+    names = [("foreground", name) for name in ("consensus", "closest", "median", "farthest")]
+    names += [("background", name) for name in ("farthest", "median")]
+    arrays = {"foreground": {}, "background": {}}
+    for i, (kind, name) in enumerate(names):
+        valid = np.zeros((HEIGHT, WIDTH), bool)
+        valid[:, i * 8 : (i + 1) * 8] = True
+        arrays[kind][f"{name}_rgb"] = np.full((HEIGHT, WIDTH, 3), 40 * (i + 1), np.uint8) * valid[..., None]
+        arrays[kind][f"{name}_valid"] = valid
+    models = infer.load_models(write_models(tmp_path, 1, streams="all"))
+    image, rows = infer.compose_frame(models, 0, arrays["foreground"], arrays["background"])
+    assert [int(image[20, 8 * i + 4, 0]) for i in range(6)] == [40, 80, 120, 160, 200, 240]
+    assert rows[0]["hole_share"] == pytest.approx(0.25)
+    assert set(infer.estimates_read(models, "foreground")) == set(arrays["foreground"])
+    assert set(infer.estimates_read(models, "background")) == set(arrays["background"])
+
+
+def test_the_papers_streams_read_consensus_and_static_background_only(tmp_path):
+    models = infer.load_models(write_models(tmp_path, 1))
+    assert infer.estimates_read(models, "foreground") == ["consensus_rgb", "consensus_valid"]
+    assert infer.estimates_read(models, "background") == ["farthest_rgb", "farthest_valid"]
 
 
 def test_paste_of_nothing_is_black():
@@ -105,7 +129,7 @@ def test_either_share_asks_for_the_coarser_level():
 
 def test_filling_touches_holes_of_the_background_only():
     images = np.full((4, 5, 7, 4), 9, np.uint8)
-    images[[0, 3], 1:3, 2:4] = 0
+    images[:, 1:3, 2:4] = 0
     holes = infer.find_holes(images)
     assert holes.sum() == 4
     coarser = np.full((3, 4, 3), 77, np.uint8)

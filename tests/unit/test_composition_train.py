@@ -126,7 +126,7 @@ def one_sample(seed=0, side=16):
     images[0, :, :, 3] = 255 * (rng.random((side, side)) < 0.6)
     images[0] &= images[0, :, :, 3:]
     target, valid = data.target_from_images(images)
-    return data.streams_from_images(images, data.TEST_STREAMS), target, valid
+    return data.streams_from_images(images, data.TRAINING_STREAMS), target, valid
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -341,7 +341,7 @@ def test_camera_without_video_is_named(sources, tmp_path):
     [
         ({"epochs": 0}, "epochs above 0"),
         ({"max_scale": 0.5}, "max_scale of at least 1"),
-        ({"test_input_share": 1.5}, "test_input_share in 0..1"),
+        ({"streams": "some"}, "streams to be one of all, paper"),
         ({"num_filters": ()}, "num_filters for level 0"),
         ({"head": "softmax"}, "head"),
     ],

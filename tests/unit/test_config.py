@@ -88,6 +88,16 @@ def test_text_from_the_command_line_is_read_by_the_schema() -> None:
     assert full["composition"]["crop"] is None
 
 
+def test_preset_holds_whatever_the_scene_says() -> None:
+    scene_settings = {"composition": {"num_filters": [8, 8, 8], "streams": "all"}}
+    composition = config.load_config({"composition": "paper"}, scene_settings, "x")["composition"]
+    assert (composition["head"], composition["streams"]) == ("direct", "paper")
+    assert composition["num_filters"] == [28, 23, 13]
+    assert config.load_config({}, {"composition": "paper"}, "x")["composition"] == composition
+    with pytest.raises(InputError, match="composition is 'papr', expected a mapping of keys or one of paper"):
+        config.load_config({"composition": "papr"}, {}, "x")
+
+
 def test_given_wins_over_scene_settings_over_defaults() -> None:
     full = config.load_config({"views": {"train_frames": 7}}, {"views": {"train_frames": 5}}, "event")
     assert full["views"]["train_frames"] == 7

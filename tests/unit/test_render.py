@@ -39,11 +39,12 @@ def make_estimates(folder: Path, name: str = "film", size=SIZE) -> None:
             writer.add_frame(frame, farthest_rgb=rgb, farthest_valid=(x < 40) | (y < 8))
 
 
-def make_models(folder: Path, num_levels: int = 2) -> list[Path]:
+def make_models(folder: Path, num_levels: int = 2, streams: str = "paper") -> list[Path]:
     torch.manual_seed(0)
     paths = []
     for level in range(num_levels):
         network = {"num_filters": 2, "unet_width": 1, "depth": 2, "head": "blend", "level": level}
+        network["streams"] = streams
         document = {"level": level, "num_levels": num_levels, "network": network}
         state = CompositionNet(**network).state_dict()
         paths.append(folder / f"level{level}.pt")
