@@ -68,6 +68,7 @@ def run_case(case: Case) -> Result:
         warnings.simplefilter("ignore")
         try:
             outcome = case.run()
+        # Whatever stops a case is what the suite is to find: it becomes the case's row, never silence.
         except Exception as error:
             outcome = Outcome(f"{type(error).__name__}: {error}", BAD)
     return Result(case, outcome, time.perf_counter() - begin)
