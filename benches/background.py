@@ -26,7 +26,7 @@ import numpy as np
 
 from benches.pareto import plot_front
 from fourd import io
-from fourd.background.__main__ import read_samples, spread
+from fourd.background.__main__ import read_samples
 from fourd.background.estimate import Samples, estimate_backgrounds
 from fourd.background.options import BackgroundOptions
 from fourd.camera import Camera
@@ -34,6 +34,7 @@ from fourd.fuse.files import DisparityFiles, Pictures, Progress
 from fourd.fuse.options import FuseOptions
 from fourd.metrics import psnr_from_mse, squared_error
 from fourd.sfm.cameras import SceneCameras, read_cameras
+from fourd.views import spread
 
 NUM_STILL = 7
 COLUMNS = (

@@ -66,6 +66,16 @@ class View:
         )
 
 
+def spread(frames: Sequence[int], count: int) -> list[int]:
+    """At most `count` of the frames, evenly spread, the ends included; of one, the middle."""
+    if count >= len(frames):
+        return list(frames)
+    if count == 1:
+        return [frames[len(frames) // 2]]
+    last = len(frames) - 1
+    return [frames[round(i * last / (count - 1))] for i in range(count)]
+
+
 def physical_view(
     scene: SceneCameras, name: str, frames: Sequence[int], size: tuple[int, int] | None
 ) -> View:

@@ -10,6 +10,6 @@ weighted median of them.
 
 from fourd.background.options import BackgroundOptions
 
-STAGE_VERSION = 2
+STAGE_VERSION = 3
 
 __all__ = ["STAGE_VERSION", "BackgroundOptions"]

@@ -17,19 +17,9 @@ from fourd.fuse.files import DisparityFiles, Pictures, Progress
 from fourd.fuse.options import FuseOptions
 from fourd.io import ArchiveWriter
 from fourd.sfm.cameras import SceneCameras, read_cameras
-from fourd.views import View, read_view
+from fourd.views import View, read_view, spread
 
 log = logging.getLogger(__name__)
-
-
-def spread(frames: Sequence[int], count: int) -> list[int]:
-    """At most `count` of the frames, evenly spread, the ends included."""
-    if count >= len(frames):
-        return list(frames)
-    if count == 1:
-        return [frames[len(frames) // 2]]
-    last = len(frames) - 1
-    return [frames[round(i * last / (count - 1))] for i in range(count)]
 
 
 def find_equal_poses(view: View, frames: Sequence[int]) -> dict[int, int]:

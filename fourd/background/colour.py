@@ -6,19 +6,29 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from fourd.background.project import place_point
-from fourd.fuse.colour_kernels import pack_images, packed_size
-from fourd.fuse.options import KEYS_A, MIN_WEIGHT
+from fourd.fuse.colour_kernels import (
+    pack_images,
+    packed_size,
+    place_points,
+    rank,
+    sample_bicubic,
+    to_byte,
+    weigh,
+)
+from fourd.fuse.options import KEYS_A
 
 # Weight of a picture whose camera sees the surface at another time, not at this one: something may
 # stand before it, or matching failed.
 SEEN_ANOTHER_TIME = 0.4
 # A camera that never sees it counts as this much worse: it may be hidden by what stands still.
-NEVER_SEEN = 0.03
+NEVER_SEEN = 0.5
 # And one to which a known surface hides it as this much worse: for want of any other.
-HIDDEN = 1e-6
+HIDDEN = 0.01
 
 _NO_CAMERA = np.uint8(255)
+_ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
+# Points that are placed, or settled, at once.
+_BLOCK = 512
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -111,120 +121,105 @@ def settle_colours(opinions: Opinions) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _mean_costs(params, u, v, t, ever, hidden, costs):
-    """Mean cost of every camera over the times at which it has the pixel in its picture, into costs."""
-    for c in range(params.shape[1]):
-        total, count = np.float32(0), 0
-        for s in range(params.shape[0]):
-            cost = place_point(params[s, c], u, v, t)[2]
-            if cost < np.inf:
-                total += cost
-                count += 1
-        bit = np.uint64(1) << np.uint64(c)
-        trust = np.float32(1)
-        if ever & bit == np.uint64(0):
-            trust = np.float32(HIDDEN) if hidden & bit != np.uint64(0) else np.float32(NEVER_SEEN)
-        costs[c] = total / (trust * np.float32(count)) if count else np.float32(np.inf)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _choose(xs, ys, inverse_depth, seen_by, hidden_from, params, camera, weight):
-    num_sources = camera.shape[0]
-    costs, best = np.empty(params.shape[1], np.float32), np.empty(params.shape[1] + 1, np.int64)
-    for i in range(inverse_depth.shape[0]):
-        ever = np.uint64(0)
-        for s in range(seen_by.shape[0]):
-            ever |= seen_by[s, i]
-        _mean_costs(params, xs[i], ys[i], inverse_depth[i], ever, hidden_from[i], costs)
-        found = 0
-        for c in range(costs.shape[0]):
-            if costs[c] == np.inf:
-                continue
-            at = found
-            while at > 0 and costs[best[at - 1]] > costs[c]:
-                best[at] = best[at - 1]
-                at -= 1
-            best[at] = c
-            found += 1
-        for k in range(min(found, num_sources)):
-            cost = costs[best[k]]
-            share = np.float32(1)
-            if found > num_sources:
-                share = max(share - cost / costs[best[num_sources]], np.float32(MIN_WEIGHT))
-            camera[k, i], weight[k, i] = best[k], share / cost
-
-
-@njit(forceinline=True, nogil=True)
-def _keys(f, a):
-    """Weights of four samples at -1, 0, 1, 2 for a point at f in 0..1. Source: Keys 1981, equation 4."""
-    g = np.float32(1) - f
-    two, three = a + np.float32(2), a + np.float32(3)
-    return (
-        a * f * g * g,
-        (two * f - three) * f * f + np.float32(1),
-        (two * g - three) * g * g + np.float32(1),
-        a * g * f * f,
-    )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _sample(
-    xs, ys, inverse_depth, seen_now, ever, params, packed, starts, a, camera, camera_weight, rgb, weight
-):
-    for i in range(inverse_depth.shape[0]):
-        for k in range(camera.shape[0]):
-            c = camera[k, i]
-            if c == _NO_CAMERA:
-                break
-            px, py, cost, _ = place_point(params[c], xs[i], ys[i], inverse_depth[i])
-            if cost == np.inf:
-                continue
+def _choose(xs, ys, ts, seen_by, hidden_from, params, camera, weight):
+    num_times, num_cameras = params.shape[:2]
+    num_sources, count = camera.shape
+    costs = np.empty((num_cameras, _BLOCK), np.float32)
+    times, ever = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.uint64)
+    best = np.empty(num_sources + 2, np.int64)
+    place = np.empty((3, _BLOCK), np.float32)
+    for first in range(0, count, _BLOCK):
+        last = min(first + _BLOCK, count)
+        us, vs, inverse_depths = xs[first:last], ys[first:last], ts[first:last]
+        px, py, cost = place[0], place[1], place[2]
+        ever[:] = 0
+        for s in range(num_times):
+            for i in range(last - first):
+                ever[i] |= seen_by[s, first + i]
+        for c in range(num_cameras):
             bit = np.uint64(1) << np.uint64(c)
-            elsewhere = (ever[i] & bit != np.uint64(0)) & (seen_now[i] & bit == np.uint64(0))
-            share = np.float32(SEEN_ANOTHER_TIME) if elsewhere else np.float32(1)
-            weight[k, i] = camera_weight[k, i] * share
-            column, row = int(px), int(py)
-            wx, wy = _keys(px - np.float32(column), a), _keys(py - np.float32(row), a)
-            # Packed pictures are three pixels wider (fuse/colour_kernels.py).
-            stride = 3 * (int(params[c, 19]) + 4)
-            first = starts[c] + stride * row + 3 * column
-            for j in range(3):
-                total = np.float32(0)
-                for m in range(4):
-                    at = first + m * stride + j
-                    left = wx[0] * np.float32(packed[at]) + wx[1] * np.float32(packed[at + 3])
-                    right = wx[2] * np.float32(packed[at + 6]) + wx[3] * np.float32(packed[at + 9])
-                    total += wy[m] * (left + right)
-                rgb[k, i, j] = np.uint8(min(max(np.rint(total), np.float32(0)), np.float32(255)))
+            total = costs[c]
+            total[:], times[:] = 0, 0
+            for s in range(num_times):
+                if s == 0 or (params[s, c] != params[s - 1, c]).any():
+                    place_points(params[s, c], us, vs, inverse_depths, px, py, cost)
+                for i in range(last - first):
+                    is_inside = cost[i] < np.inf
+                    total[i] += cost[i] if is_inside else np.float32(0)
+                    times[i] += is_inside
+            for i in range(last - first):
+                trust = np.float32(1)
+                if ever[i] & bit == np.uint64(0):
+                    is_hidden = hidden_from[first + i] & bit != np.uint64(0)
+                    trust = np.float32(HIDDEN) if is_hidden else np.float32(NEVER_SEEN)
+                total[i] = total[i] / (trust * np.float32(times[i])) if times[i] else np.float32(np.inf)
+        for i in range(last - first):
+            found = rank(_ALL, costs, i, num_sources + 1, best)
+            left_out = costs[best[num_sources], i] if found > num_sources else np.float32(np.inf)
+            for k in range(min(found, num_sources)):
+                camera[k, first + i] = best[k]
+                weight[k, first + i] = weigh(costs[best[k], i], left_out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample(xs, ys, ts, seen_now, ever, params, packed, starts, a, camera, camera_weight, rgb, weight):
+    num_cameras = params.shape[0]
+    num_sources, count = camera.shape
+    widths = params[:, 19].astype(np.int64) + 1
+    px, columns = np.empty((num_cameras, _BLOCK), np.float32), np.empty(16, np.float32)
+    py, cost = np.empty_like(px), np.empty_like(px)
+    for first in range(0, count, _BLOCK):
+        last = min(first + _BLOCK, count)
+        for c in range(num_cameras):
+            place_points(params[c], xs[first:last], ys[first:last], ts[first:last], px[c], py[c], cost[c])
+        for i in range(first, last):
+            for k in range(num_sources):
+                c = camera[k, i]
+                if c == _NO_CAMERA:
+                    break
+                if cost[c, i - first] == np.inf:
+                    continue
+                bit = np.uint64(1) << np.uint64(c)
+                elsewhere = (ever[i] & bit != np.uint64(0)) & (seen_now[i] & bit == np.uint64(0))
+                weight[k, i] = camera_weight[k, i] * (
+                    np.float32(SEEN_ANOTHER_TIME) if elsewhere else np.float32(1)
+                )
+                red, green, blue = sample_bicubic(
+                    packed, starts[c], widths[c], px[c, i - first], py[c, i - first], a, columns
+                )
+                rgb[k, i, 0], rgb[k, i, 1], rgb[k, i, 2] = to_byte(red), to_byte(green), to_byte(blue)
 
 
 @njit(cache=True, nogil=True)
 def _settle(rgb, weight, out, valid):
-    num_times, num_sources = weight.shape[:2]
-    longest = num_times * num_sources
-    values, weights = np.empty(longest, np.uint8), np.empty(longest, np.float32)
-    for i in range(out.shape[0]):
+    """The least value up to which half of the weight lies, by bisection of all points of a block at once."""
+    num_times, num_sources, count = weight.shape
+    values = np.empty((num_times * num_sources, _BLOCK), np.int32)
+    weights = np.empty(values.shape, np.float32)
+    total, summed = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
+    low, high = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int32)
+    for first in range(0, count, _BLOCK):
+        size = min(_BLOCK, count - first)
+        total[:] = 0
+        for n in range(len(values)):
+            for i in range(size):
+                weights[n, i] = weight[n // num_sources, n % num_sources, first + i]
+                total[i] += weights[n, i]
         for j in range(3):
-            count, total = 0, np.float32(0)
-            for s in range(num_times):
-                for k in range(num_sources):
-                    share, value = weight[s, k, i], rgb[s, k, i, j]
-                    if share == 0:
-                        continue
-                    at = count
-                    while at > 0 and values[at - 1] > value:
-                        values[at], weights[at] = values[at - 1], weights[at - 1]
-                        at -= 1
-                    values[at], weights[at] = value, share
-                    count += 1
-                    total += share
-            if count == 0:
-                break
-            summed, middle = np.float32(0), 0
-            for m in range(count):
-                summed += weights[m]
-                middle = m
-                if 2 * summed >= total:
-                    break
-            out[i, j] = values[middle]
-            valid[i] = True
+            for n in range(len(values)):
+                for i in range(size):
+                    values[n, i] = rgb[n // num_sources, n % num_sources, first + i, j]
+            low[:], high[:] = 0, 255
+            for _ in range(8):
+                summed[:] = 0
+                for n in range(len(values)):
+                    for i in range(size):
+                        is_below = values[n, i] <= (low[i] + high[i]) >> 1
+                        summed[i] += weights[n, i] if is_below else np.float32(0)
+                for i in range(size):
+                    middle, is_enough = (low[i] + high[i]) >> 1, summed[i] + summed[i] >= total[i]
+                    low[i], high[i] = (low[i], middle) if is_enough else (middle + 1, high[i])
+            for i in range(size):
+                out[first + i, j] = np.uint8(low[i])
+        for i in range(size):
+            valid[first + i] = total[i] > 0

@@ -1,6 +1,7 @@
 """The backgrounds of some poses: depth voted over all pairs and times, then one colour per pixel."""
 
 import dataclasses
+import logging
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,15 +14,18 @@ from fourd.background.colour import (
     sample_pictures,
     settle_colours,
 )
-from fourd.background.fill import drop_speckles, fill_holes
+from fourd.background.extend import extend_surfaces
+from fourd.background.fill import drop_ghosts, drop_speckles, fill_holes
 from fourd.background.options import ESTIMATES, BackgroundOptions
-from fourd.background.project import pack_cameras
 from fourd.background.surfaces import BYTES_PER_TIME, Surfaces, find_surfaces
 from fourd.background.visibility import find_hidden
 from fourd.background.vote import StaticDepth, bytes_per_pixel, vote_depth
 from fourd.camera import Camera
 from fourd.fuse.files import DisparityFiles, Pictures, Progress
+from fourd.fuse.geometry import pack_cameras
 from fourd.fuse.options import FuseOptions
+
+log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,7 +56,8 @@ def estimate_backgrounds(
     Raises InputError for more than 64 cameras, or a pair without pictures.
     """
     depths = _vote_all(targets, samples, fuse_options, options, progress)
-    filled = [_mend(depth, options.fill_px) for depth in depths]
+    everybody = np.uint64((1 << len(samples.pictures.names)) - 1)
+    filled = [_mend(depth, options.fill_px, everybody) for depth in depths]
     points = [
         _points_of(target, depth, holes, samples)
         for target, depth, holes in zip(targets, depths, filled, strict=True)
@@ -95,12 +100,24 @@ def _vote_all(
     return depths
 
 
-def _mend(depth: StaticDepth, widest_px: int) -> list[np.ndarray]:
-    """Speckles and holes of both estimates, in place. Returns what was filled, (H, W) bool of each."""
+def _mend(depth: StaticDepth, widest_px: int, everybody: np.uint64) -> list[np.ndarray]:
+    """Mend both estimates in place. Returns what was filled, (H, W) bool of each.
+
+    everybody: bits of all cameras. Whether one sees a surface that was guessed nobody knows: all may.
+    """
     filled = []
     for inverse_depth, seen_by in zip(depth.inverse_depth, depth.seen_by, strict=True):
         drop_speckles(inverse_depth, seen_by)
+        num_ghosts = drop_ghosts(inverse_depth, seen_by)
+        log.debug("%d pixels of what passed are taken out", num_ghosts)
         filled.append(fill_holes(inverse_depth, seen_by, widest_px))
+    unknown = depth.inverse_depth < 0
+    extended = unknown & extend_surfaces(depth.inverse_depth[0])
+    for estimate in range(len(ESTIMATES)):
+        # One guess for both, so that it gets its colour once.
+        depth.inverse_depth[estimate][extended[estimate]] = depth.inverse_depth[0][extended[estimate]]
+        depth.seen_by[estimate][:, extended[estimate]] = everybody
+        filled[estimate] |= extended[estimate]
     depth.num_times[~depth.seen_by[0].any(axis=0) | filled[0]] = 0
     return filled
 
@@ -135,7 +152,10 @@ def _points_of(target: Camera, depth: StaticDepth, filled: list[np.ndarray], sam
         depth.inverse_depth[0][measured],
     )
     hidden_from = find_hidden(
-        *place, occluders, pack_cameras(target, cameras), [camera.size for camera in cameras.values()]
+        *place,
+        occluders,
+        pack_cameras(target, list(cameras.values())),
+        [camera.size for camera in cameras.values()],
     )
     seen = np.concatenate(seen_by, axis=1)
     is_filled = np.concatenate([holes[mask] for holes, mask in zip(filled, wanted, strict=True)])
@@ -151,7 +171,10 @@ def _colour_all(
     fuse_options: FuseOptions,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """(M, 3) uint8 and (M,) bool for the points of every target."""
-    params = [np.stack([pack_cameras(target, cameras) for cameras in samples.cameras]) for target in targets]
+    params = [
+        np.stack([pack_cameras(target, list(cameras.values())) for cameras in samples.cameras])
+        for target in targets
+    ]
     size = bytes_per_point(fuse_options.num_sources, len(samples.frames))
     parts = [_split(len(p.x), size, fuse_options.memory_mb) for p in points]
     colours: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in targets]

@@ -1,4 +1,4 @@
-"""Speckles and holes of the depth."""
+"""Speckles, ghosts and holes of the depth."""
 
 import numpy as np
 from numba import njit
@@ -11,6 +11,8 @@ FAR = 0.25
 # A pixel is a speckle if a smaller share of the pixels around it is on its surface.
 SPECKLE_RADIUS_PX = 3
 LEAST_NEIGHBOURS = 0.25
+# What is seen at a smaller share of the sampled times may be something that passed.
+LEAST_TIMES = 0.4
 
 
 def drop_speckles(inverse_depth: np.ndarray, seen_by: np.ndarray) -> None:
@@ -26,6 +28,24 @@ def drop_speckles(inverse_depth: np.ndarray, seen_by: np.ndarray) -> None:
         _find_lonely(inverse_depth, np.float32(FAR * np.median(known)), lonely)
     inverse_depth[lonely] = -1
     seen_by[:, lonely] = 0
+
+
+def drop_ghosts(inverse_depth: np.ndarray, seen_by: np.ndarray) -> int:
+    """Make those parts unknown that few of the sampled times show and that continue nothing around them.
+
+    inverse_depth: (H, W) float32, negative = unknown;  seen_by: (S, H, W) uint64; both changed in place
+    Where nothing matches what stands still, all that is ever seen is what passes before it. What stands
+    still and was hidden for most of the time is on one surface with what is known around it, along half of
+    that border at least. A part with nothing known around it stays. Returns the number of pixels.
+    """
+    rare = (inverse_depth >= 0) & (np.count_nonzero(seen_by, axis=0) < LEAST_TIMES * len(seen_by))
+    ghosts = np.zeros(rare.shape, bool)
+    if rare.any():
+        far = np.float32(FAR * np.median(inverse_depth[inverse_depth >= 0]))
+        _find_apart(inverse_depth, rare, far, ghosts)
+    inverse_depth[ghosts] = -1
+    seen_by[:, ghosts] = 0
+    return int(ghosts.sum())
 
 
 def fill_holes(inverse_depth: np.ndarray, seen_by: np.ndarray, widest_px: int) -> np.ndarray:
@@ -62,6 +82,44 @@ def _find_lonely(inverse_depth, far, lonely):
                 for u in range(left, right):
                     agreeing += abs(inverse_depth[v, u] - here) <= difference
             lonely[y, x] = agreeing < LEAST_NEIGHBOURS * (bottom - top) * (right - left)
+
+
+@njit(cache=True, nogil=True)
+def _find_apart(inverse_depth, rare, far, apart):
+    """Connected parts of `rare` whose border is mostly with other surfaces, into `apart`."""
+    height, width = inverse_depth.shape
+    part = np.zeros((height, width), np.int64)
+    members = np.empty((rare.sum(), 2), np.int64)
+    number = 0
+    for first_y in range(height):
+        for first_x in range(width):
+            if not rare[first_y, first_x] or part[first_y, first_x] > 0:
+                continue
+            number += 1
+            part[first_y, first_x] = number
+            members[0] = first_y, first_x
+            size, visited, agreeing, others = 1, 0, 0, 0
+            while visited < size:
+                y, x = members[visited]
+                visited += 1
+                for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                    v, u = y + dy, x + dx
+                    if v < 0 or u < 0 or v >= height or u >= width:
+                        continue
+                    here, there = inverse_depth[y, x], inverse_depth[v, u]
+                    if there < 0 or part[v, u] == number:
+                        continue
+                    is_one = abs(there - here) <= ONE_SURFACE_NEARBY * max(here, there, far)
+                    if is_one and rare[v, u]:
+                        part[v, u] = number
+                        members[size] = v, u
+                        size += 1
+                    else:
+                        agreeing += is_one
+                        others += not is_one
+            if agreeing < others:
+                for i in range(size):
+                    apart[members[i, 0], members[i, 1]] = True
 
 
 @njit(cache=True, nogil=True)

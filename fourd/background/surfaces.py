@@ -12,15 +12,13 @@ from numba import njit
 
 from fourd.camera import Camera
 from fourd.errors import InputError
-from fourd.fuse.geometry import DisparityMap, PairFrame, maps_of_pair, source_rows
+from fourd.fuse.cpu import CpuBackend
+from fourd.fuse.geometry import PairFrame, make_sources, maps_of_pair
 from fourd.fuse.options import MAX_CAMERAS, FuseOptions
-from fourd.fuse.reduce_kernels import merge_maps
-from fourd.fuse.splat_kernels import splat_map
+from fourd.fuse.reduce_kernels import LANES, gather_sorted, support
 
 # Surfaces kept per pixel and time: what moves, what stands still, and one wrong match.
 NUM_SURFACES = 3
-
-_LOW_BITS = np.uint32(0xFFFFFFFF)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,19 +62,14 @@ def find_surfaces(
     Raises InputError for more than 64 cameras, or a pair with another camera.
     """
     _check_cameras(pairs, names)
-    width, height = target.size
-    layers = np.zeros((len(pairs), rows[1] - rows[0], width), np.int64)
-    keys = np.zeros((2, *layers.shape[1:]), np.int64)
-    tolerance = np.float32(options.tolerance)
+    backend = CpuBackend(make_sources(target, {}, {}), options, target.size, len(pairs), rows[1] - rows[0])
     masks = []
-    for pair, layer in zip(pairs, layers, strict=True):
-        for side, disparity_map in enumerate(maps_of_pair(pair, target)):
-            _splat(disparity_map, rows, height, options.footprint, keys[side])
-        merge_maps(keys[0], keys[1], tolerance, layer)
+    for i, pair in enumerate(pairs):
+        backend.layer(i, maps_of_pair(pair, target), rows)
         masks.append(1 << names.index(pair.left) | 1 << names.index(pair.right))
     cluster_layers(
-        layers, np.array(masks, np.uint64), tolerance, into.inverse_depth[time], into.variance[time],
-        into.cameras[time], into.num_pairs[time],
+        backend.layers, np.array(masks, np.uint64), np.float32(options.tolerance), into.inverse_depth[time],
+        into.variance[time], into.cameras[time], into.num_pairs[time],
     )  # fmt: skip
 
 
@@ -95,58 +88,6 @@ def _check_cameras(pairs: Sequence[PairFrame], names: Sequence[str]) -> None:
                 )
 
 
-def _splat(m: DisparityMap, rows: tuple[int, int], height: int, footprint: float, keys: np.ndarray) -> None:
-    scalars = np.array([m.disparity_at_infinity, m.inverse_depth_per_px, m.sigma_px], np.float32)
-    splat_map(
-        m.disparity, m.confidence, m.A, m.b, scalars, source_rows(m, rows, height), rows[0],
-        np.float32(footprint), keys,
-    )  # fmt: skip
-
-
-@njit(cache=True, nogil=True)
-def _gather(layers, y, x, masks, keys, t, variance, cameras):
-    """Samples of one pixel, the closest first: inverse depth, squared sigma, cameras. Returns their number.
-
-    A key holds the inverse depth in its upper half and the complement of sigma in the lower
-    (fuse/splat_kernels.py); 0 is blank.
-    """
-    count = 0
-    for p in range(layers.shape[0]):
-        key = layers[p, y, x]
-        if key == 0:
-            continue
-        at = count
-        while at > 0 and keys[at - 1] < key:
-            keys[at], cameras[at] = keys[at - 1], cameras[at - 1]
-            at -= 1
-        keys[at], cameras[at] = key, masks[p]
-        count += 1
-    for i in range(count):
-        t[i] = np.uint32(keys[i] >> 32).view(np.float32)
-        sigma = np.uint32(_LOW_BITS - np.uint32(keys[i])).view(np.float32)
-        variance[i] = sigma * sigma
-    return count
-
-
-@njit(cache=True, nogil=True)
-def _best_supported(t, variance, count, squared):
-    """Sample that most of the samples agree with, the closest of equals; -1 if none is left."""
-    best, most, left = -1, 0, 0
-    for i in range(count):
-        left += t[i] >= 0
-    for i in range(count):
-        if t[i] < 0 or most == left:
-            continue
-        number = 0
-        for j in range(count):
-            difference = t[j] - t[i]
-            agree = difference * difference <= squared * (variance[i] + variance[j])
-            number += agree & (t[j] >= 0)
-        if number > most:
-            best, most = i, number
-    return best
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def cluster_layers(layers, masks, tolerance, inverse_depth, variance, cameras, num_pairs):
     """The surfaces of every pixel from the layers of all pairs of one time.
@@ -158,29 +99,35 @@ def cluster_layers(layers, masks, tolerance, inverse_depth, variance, cameras, n
     Surfaces are taken in turn, the best supported first, with all samples that agree with it. Its
     variance is that of one typical sample: errors of pairs that share cameras are not independent.
     """
-    longest = layers.shape[0]
+    longest = layers.shape[0] + 2 * LANES
     keys, near = np.empty(longest, np.int64), np.empty(longest, np.uint64)
     t, spread = np.empty(longest, np.float32), np.empty(longest, np.float32)
     squared = tolerance * tolerance
     for y in range(layers.shape[1]):
         for x in range(layers.shape[2]):
-            count = _gather(layers, y, x, masks, keys, t, spread, near)
-            for k in range(inverse_depth.shape[0]):
-                seed = _best_supported(t, spread, count, squared)
-                if seed < 0:
-                    break
-                here, width = t[seed], spread[seed]
-                number, union = 0, np.uint64(0)
+            count = gather_sorted(layers, y, x, masks, keys, t, spread, near)
+            left = count
+            for k in range(inverse_depth.shape[0] if count else 0):
+                best, number, union = -1, 0, np.uint64(0)
+                for i in range(count):
+                    # What is taken has no variance, and agrees with nothing.
+                    if number == left or np.isnan(spread[i]):
+                        continue
+                    agreeing, cameras_of = support(t, spread, near, count, i, squared)
+                    if agreeing > number:
+                        best, number, union = i, agreeing, cameras_of
+                here, width = t[best], spread[best]
                 total, weights = np.float32(0), np.float32(0)
                 for j in range(count):
                     difference = t[j] - here
-                    if t[j] >= 0 and difference * difference <= squared * (width + spread[j]):
+                    if difference * difference <= squared * (width + spread[j]):
                         total += width / spread[j] * difference
                         weights += width / spread[j]
-                        number += 1
-                        union |= near[j]
-                        t[j] = np.float32(-1)
+                        spread[j] = np.nan
                 inverse_depth[k, y, x] = max(here + total / weights, np.float32(0))
                 variance[k, y, x] = width * np.float32(number) / weights
                 cameras[k, y, x] = union
                 num_pairs[k, y, x] = np.uint8(min(number, 255))
+                left -= number
+                if left == 0:
+                    break

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from fourd.background.project import place_point
+from fourd.fuse.colour_kernels import place_point
 
 # Inverse depths that differ by a smaller share are one surface.
 ONE_SURFACE = 0.05

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from fourd.fuse.geometry import Sources
 from fourd.fuse.options import MIN_SINE_SQUARED, MIN_WEIGHT
 
 NO_SOURCE = np.uint8(255)
@@ -20,13 +19,6 @@ _HALF = np.float32(0.5)
 _NEVER = np.float32(np.inf)
 _MIN_WEIGHT = np.float32(MIN_WEIGHT)
 _MIN_SINE = np.float32(MIN_SINE_SQUARED)
-
-
-def pack_sources(sources: Sources) -> np.ndarray:
-    """(C, 26) float32: A row by row (9), b (3), lens (9), distortion (5) of every camera."""
-    count = len(sources.names)
-    parts = [sources.A.reshape(count, 9), sources.b, sources.lens, sources.distortion]
-    return np.ascontiguousarray(np.concatenate(parts, axis=1))
 
 
 def packed_size(images: Sequence[np.ndarray]) -> int:
@@ -57,42 +49,48 @@ def pack_images(images: Sequence[np.ndarray], packed: np.ndarray) -> np.ndarray:
     return np.array(starts, np.int64)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _place_row(p, v, us, ts, px, py, cost):
-    """Where one source sees some points of a target row.
+@njit(forceinline=True, nogil=True, error_model="numpy")
+def place_point(p, u, v, t):
+    """Where a source sees pixel (u, v) of the target at inverse depth t.
 
-    p: (26,) float32, a row of `pack_sources`;  v: target row;  us, ts: (N,) column, inverse depth
-    px, py, cost: (N,) float32, changed: place in the source and the cost of using it, infinite where
-    it cannot be: behind it, outside its image, or more than 90 degrees away. No branches: this loop
-    runs in vector registers.
+    p: (26,) float32, a row of `pack_cameras`
+    Returns its place in the source's picture, px, the cost of using it, and its inverse depth there. The
+    cost is infinite where it cannot be used: behind the source, outside its picture, or more than 90
+    degrees away. No branches: loops over this run in vector registers.
     """
-    a0, a1, a2, b0, b1, b2 = p[0], p[3], p[6], p[9], p[10], p[11]
-    row0, row1, row2 = p[1] * v + p[2], p[4] * v + p[5], p[7] * v + p[8]
-    fx, skew, cx, fy, cy, far, focal_ratio = p[12], p[13], p[14], p[15], p[16], p[17], p[18]
-    right, bottom, k1, k2, p1, p2, k3 = p[19], p[20], p[21], p[22], p[23], p[24], p[25]
+    d0, d1, d2 = p[0] * u + (p[1] * v + p[2]), p[3] * u + (p[4] * v + p[5]), p[6] * u + (p[7] * v + p[8])
+    e0, e1, e2 = t * p[9], t * p[10], t * p[11]
+    q0, q1, q2 = d0 + e0, d1 + e1, d2 + e2
+    inverse = _ONE / q2
+    x, y = q0 * inverse, q1 * inverse
+    xx, xy, yy = x * x, x * y, y * y
+    r2 = xx + yy
+    k1, k2, p1, p2, k3 = p[21], p[22], p[23], p[24], p[25]
+    radial = _ONE + r2 * (k1 + r2 * (k2 + r2 * k3))
+    xd = x * radial + (p1 + p1) * xy + p2 * (r2 + (xx + xx))
+    yd = y * radial + p1 * (r2 + (yy + yy)) + (p2 + p2) * xy
+    at_x, at_y = p[12] * xd + p[13] * yd + p[14], p[15] * yd + p[16]
+    c0, c1, c2 = e1 * d2 - e2 * d1, e2 * d0 - e0 * d2, e0 * d1 - e1 * d0
+    squares = (q0 * q0 + q1 * q1 + q2 * q2) * (d0 * d0 + d1 * d1 + d2 * d2)
+    sine_squared = (c0 * c0 + c1 * c1 + c2 * c2) / squares
+    coarser = max(p[18] * q2, _ONE)
+    right, bottom = p[19], p[20]
+    # A pixel is an area: half of one beyond the outer centres is still the image.
+    inside = (at_x >= -_HALF) & (at_x <= right + _HALF) & (at_y >= -_HALF) & (at_y <= bottom + _HALF)
+    facing = q0 * d0 + q1 * d1 + q2 * d2 > _ZERO
+    usable = inside & facing & (q2 > _ZERO) & (r2 <= p[17])
+    cost = np.sqrt(sine_squared + _MIN_SINE) * coarser if usable else _NEVER
+    return min(max(at_x, _ZERO), right), min(max(at_y, _ZERO), bottom), cost, t * inverse
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def place_points(p, us, vs, ts, px, py, cost):
+    """`place_point` of N points into px, py and cost, (N,) float32.
+
+    us, vs, ts: (N,) column, row, inverse depth in the target
+    """
     for i in range(us.shape[0]):
-        u, t = us[i], ts[i]
-        d0, d1, d2 = a0 * u + row0, a1 * u + row1, a2 * u + row2
-        e0, e1, e2 = t * b0, t * b1, t * b2
-        q0, q1, q2 = d0 + e0, d1 + e1, d2 + e2
-        inverse = _ONE / q2
-        x, y = q0 * inverse, q1 * inverse
-        xx, xy, yy = x * x, x * y, y * y
-        r2 = xx + yy
-        radial = _ONE + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + (p1 + p1) * xy + p2 * (r2 + (xx + xx))
-        yd = y * radial + p1 * (r2 + (yy + yy)) + (p2 + p2) * xy
-        at_x, at_y = fx * xd + skew * yd + cx, fy * yd + cy
-        c0, c1, c2 = e1 * d2 - e2 * d1, e2 * d0 - e0 * d2, e0 * d1 - e1 * d0
-        squares = (q0 * q0 + q1 * q1 + q2 * q2) * (d0 * d0 + d1 * d1 + d2 * d2)
-        sine_squared = (c0 * c0 + c1 * c1 + c2 * c2) / squares
-        coarser = max(focal_ratio * q2, _ONE)
-        # A pixel is an area: half of one beyond the outer centres is still the image.
-        inside = (at_x >= -_HALF) & (at_x <= right + _HALF) & (at_y >= -_HALF) & (at_y <= bottom + _HALF)
-        facing = q0 * d0 + q1 * d1 + q2 * d2 > _ZERO
-        usable = inside & facing & (q2 > _ZERO) & (r2 <= far)
-        px[i], py[i] = min(max(at_x, _ZERO), right), min(max(at_y, _ZERO), bottom)
-        cost[i] = np.sqrt(sine_squared + _MIN_SINE) * coarser if usable else _NEVER
+        px[i], py[i], cost[i], _ = place_point(p, us[i], vs[i], ts[i])
 
 
 @njit(cache=True, nogil=True)
@@ -109,7 +107,7 @@ def _keys(f, a):
 
 
 @njit(cache=True, nogil=True)
-def _sample(image, start, width, px, py, a, columns):
+def sample_bicubic(image, start, width, px, py, a, columns):
     """Bicubic r, g, b at (px, py) of an image of `pack_images`, `width` columns wide before padding.
 
     columns: (16,) float32 scratch. The four pixels of a row are twelve adjacent bytes, so one loop
@@ -132,7 +130,7 @@ def _sample(image, start, width, px, py, a, columns):
 
 
 @njit(cache=True, nogil=True)
-def _rank(mask, cost, x, keep, best):
+def rank(mask, cost, x, keep, best):
     """The `keep` cameras of a mask of least finite cost, in order. Returns their number."""
     found = 0
     for c in range(cost.shape[0]):
@@ -149,13 +147,13 @@ def _rank(mask, cost, x, keep, best):
 
 
 @njit(cache=True, nogil=True)
-def _to_byte(value):
+def to_byte(value):
     """Nearest of 0..255, halves to even."""
     return np.uint8(min(max(np.rint(value), _ZERO), np.float32(255)))
 
 
 @njit(forceinline=True, nogil=True, error_model="numpy")
-def _weight(cost, left_out):
+def weigh(cost, left_out):
     """Weight of a source, given the cost of the best that is left out; infinite if none is."""
     w = _ONE / cost
     return w * max(_ONE - cost / left_out, _MIN_WEIGHT) if left_out < _NEVER else w
@@ -189,7 +187,7 @@ def sample_colours(chosen, cameras, params, image, starts, first_row, num_source
     """Colours of chosen depths from the cameras that may have seen them.
 
     chosen: (E, h, W) float32 inverse depth, blank < 0;  cameras: (E, h, W) uint64
-    params: (C, 26) float32, `pack_sources`;  image, starts: `pack_images`
+    params: (C, 26) float32, `pack_cameras`;  image, starts: `pack_images`
     a: Keys' parameter, float32;  columns: (16,) float32 scratch
     rgb: (E, h, W, 3) uint8, source: (E, h, W) uint8 camera of least cost, 255 where there is no
     colour; both changed in place, both start as blank (0, 255)
@@ -201,15 +199,15 @@ def sample_colours(chosen, cameras, params, image, starts, first_row, num_source
     num_cameras = params.shape[0]
     best, widths = np.empty(num_sources + 2, np.int64), params[:, 19].astype(np.int64) + 1
     twins = np.empty(width, np.int64)
-    us, ts = np.empty(width, np.float32), np.empty(width, np.float32)
+    us, vs, ts = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     px = np.empty((num_cameras, width), np.float32)
     py, cost = np.empty_like(px), np.empty_like(px)
     for e in range(num_estimates):
         for y in range(height):
             count = _collect_points(chosen, cameras, e, y, us, ts, twins)
-            v = np.float32(y + first_row)
+            vs[:count] = np.float32(y + first_row)
             for c in range(num_cameras):
-                _place_row(params[c], v, us[:count], ts[:count], px[c], py[c], cost[c])
+                place_points(params[c], us[:count], vs[:count], ts[:count], px[c], py[c], cost[c])
             i = -1
             for x in range(width):
                 if twins[x] == -2:
@@ -220,19 +218,19 @@ def sample_colours(chosen, cameras, params, image, starts, first_row, num_source
                         rgb[e, y, x, j] = rgb[twins[x], y, x, j]
                     continue
                 i += 1
-                found = _rank(cameras[e, y, x], cost, i, num_sources + 1, best)
+                found = rank(cameras[e, y, x], cost, i, num_sources + 1, best)
                 if found == 0:
                     continue
                 left_out = cost[best[num_sources], i] if found > num_sources else _NEVER
                 red, green, blue, weights = _ZERO, _ZERO, _ZERO, _ZERO
                 for k in range(min(found, num_sources)):
                     c = best[k]
-                    w = _weight(cost[c, i], left_out)
-                    r, g, b = _sample(image, starts[c], widths[c], px[c, i], py[c, i], a, columns)
+                    w = weigh(cost[c, i], left_out)
+                    r, g, b = sample_bicubic(image, starts[c], widths[c], px[c, i], py[c, i], a, columns)
                     red += w * r
                     green += w * g
                     blue += w * b
                     weights += w
                 source[e, y, x] = np.uint8(best[0])
-                rgb[e, y, x, 0], rgb[e, y, x, 1] = _to_byte(red / weights), _to_byte(green / weights)
-                rgb[e, y, x, 2] = _to_byte(blue / weights)
+                rgb[e, y, x, 0], rgb[e, y, x, 1] = to_byte(red / weights), to_byte(green / weights)
+                rgb[e, y, x, 2] = to_byte(blue / weights)

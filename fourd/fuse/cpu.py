@@ -25,18 +25,21 @@ def _scratch(name: str, shape: tuple[int, ...], dtype: type) -> np.ndarray:
 
 
 class CpuBackend:
-    """Projection, reduction and colours on one core. Arrays that it returns last until the next call."""
+    """Projection, reduction and colours on one core. Arrays that it returns last until the next call.
+
+    layers: (P, rows, W) int64, the cost volume of a tile
+    """
 
     def __init__(
         self, sources: Sources, options: FuseOptions, size: tuple[int, int], num_pairs: int, rows: int
     ) -> None:
         """size: (width, height) of the target;  rows: of the highest tile."""
-        self._params = colour_kernels.pack_sources(sources)
+        self._params = sources.params
         self._options = options
         self._height = size[1]
         self._pixels = _scratch("pixels", (colour_kernels.packed_size(sources.images),), np.uint8)
         self._starts = colour_kernels.pack_images(sources.images, self._pixels)
-        self._layers = _scratch("layers", (num_pairs, rows, size[0]), np.int64)
+        self.layers = _scratch("layers", (num_pairs, rows, size[0]), np.int64)
         self._keys = _scratch("keys", (2, rows, size[0]), np.int64)
         # Blank before every pair: merging reads them, and leaves them so.
         self._keys[:] = 0
@@ -47,7 +50,7 @@ class CpuBackend:
         left, right = self._keys[:, :height]
         points = self._splat(maps[0], rows, left) + self._splat(maps[1], rows, right)
         reduce_kernels.merge_maps(
-            left, right, np.float32(self._options.tolerance), self._layers[index, :height]
+            left, right, np.float32(self._options.tolerance), self.layers[index, :height]
         )
         return points
 
@@ -62,7 +65,7 @@ class CpuBackend:
         self, masks: np.ndarray, rules: FusionRules, rows: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Chosen inverse depth (4, h, W), cameras (4, h, W) uint64 and counts (2, h, W) uint8."""
-        layers = self._layers[:, : rows[1] - rows[0]]
+        layers = self.layers[:, : rows[1] - rows[0]]
         shape = layers.shape[1:]
         chosen = _scratch("chosen", (4, *shape), np.float32)
         cameras = _scratch("cameras", (4, *shape), np.uint64)

@@ -10,6 +10,7 @@ points at infinity are ordinary.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -91,45 +92,58 @@ class Sources:
     """The original images and how target pixels map to them; C cameras.
 
     names: (C,) bit and index of every camera in masks and `source`
-    A: (C, 3, 3), b: (C, 3) float32: target pixel and inverse depth to homogeneous image plane
-    lens: (C, 9) float32: fx, skew, cx, fy, cy, largest squared radius of the image plane,
-        target focal length over source focal length, width - 1, height - 1
-    distortion: (C, 5) float32;  images: C arrays (H, W, 3) uint8
+    params: (C, 26) float32, `pack_cameras`;  images: C arrays (H, W, 3) uint8
     """
 
     names: tuple[str, ...]
-    A: np.ndarray
-    b: np.ndarray
-    lens: np.ndarray
-    distortion: np.ndarray
+    params: np.ndarray
     images: tuple[np.ndarray, ...]
+
+    @property
+    def A(self) -> np.ndarray:
+        """(C, 3, 3), see `pack_cameras`, as the three below."""
+        return self.params[:, :9].reshape(-1, 3, 3)
+
+    @property
+    def b(self) -> np.ndarray:
+        """(C, 3)"""
+        return self.params[:, 9:12]
+
+    @property
+    def lens(self) -> np.ndarray:
+        """(C, 9)"""
+        return self.params[:, 12:21]
+
+    @property
+    def distortion(self) -> np.ndarray:
+        """(C, 5)"""
+        return self.params[:, 21:]
 
 
 def make_sources(target: Camera, cameras: dict[str, Camera], images: dict[str, np.ndarray]) -> Sources:
     """Sources in the order of `images`; the cameras are those of the same instant."""
-    names = tuple(images)
+    params = pack_cameras(target, [cameras[name] for name in images])
+    return Sources(tuple(images), params, tuple(np.ascontiguousarray(image) for image in images.values()))
+
+
+def pack_cameras(target: Camera, cameras: Sequence[Camera]) -> np.ndarray:
+    """(C, 26) float32: how every camera sees pixels of a target.
+
+    A row by row (9), b (3): pixel (u, v) of the target at inverse depth t is at A @ [u, v, 1] + t * b on
+    the image plane of the camera, homogeneous
+    lens (9): fx, skew, cx, fy, cy, largest squared radius on the image plane, target focal length over the
+    camera's, width - 1, height - 1;  distortion (5): k1, k2, p1, p2, k3
+    """
+    rows = []
     ray_from_pixel = np.linalg.inv(target.K)
-    A, b, lens = [], [], []
-    for name in names:
-        camera = cameras[name]
-        source_from_target = camera.R @ target.R.T
-        A.append(source_from_target @ ray_from_pixel)
-        b.append(camera.t - source_from_target @ target.t)
-        width, height = camera.size
-        K = camera.K
-        lens.append(
-            [K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2], _largest_radius_squared(camera)]
-            + [target.focal_px / camera.focal_px, width - 1, height - 1]
-        )
-    count = len(names)
-    return Sources(
-        names,
-        np.reshape(A, (count, 3, 3)).astype(np.float32),
-        np.reshape(b, (count, 3)).astype(np.float32),
-        np.reshape(lens, (count, 9)).astype(np.float32),
-        np.reshape([cameras[n].distortion for n in names], (count, 5)).astype(np.float32),
-        tuple(np.ascontiguousarray(images[n]) for n in names),
-    )
+    for camera in cameras:
+        camera_from_target = camera.R @ target.R.T
+        A, b = camera_from_target @ ray_from_pixel, camera.t - camera_from_target @ target.t
+        K, (width, height) = camera.K, camera.size
+        lens = [K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2], _largest_radius_squared(camera)]
+        lens += [target.focal_px / camera.focal_px, width - 1, height - 1]
+        rows.append([*A.ravel(), *b, *lens, *camera.distortion])
+    return np.array(rows, np.float32).reshape(len(rows), 26)
 
 
 def _largest_radius_squared(camera: Camera) -> float:

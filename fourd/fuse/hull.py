@@ -14,10 +14,12 @@ import numpy as np
 
 from fourd.camera import Camera
 from fourd.errors import InputError
-from fourd.fuse.hull_kernels import BACKGROUND, MAX_INTERVALS, MOVING, UNKNOWN, carve_rays
+from fourd.fuse.geometry import pack_cameras
+from fourd.fuse.hull_kernels import MAX_INTERVALS, carve_rays
 from fourd.fuse.hull_photo import NUM_COMPARED, aggregate, choose_levels, compare_sources
 from fourd.geometry import angle_deg
 from fourd.image import grey_from_rgb, resize_area
+from fourd.silhouettes.options import BACKGROUND, MOVING, UNKNOWN
 
 # More levels than this along one ray say no more about a surface that two pictures hardly share.
 MAX_LEVELS = 256
@@ -181,45 +183,32 @@ class _Pictures:
 
 
 def pack_views(target: Camera, cameras: list[Camera]) -> np.ndarray:
-    """(C, 26) float32 how rays of the target map to every camera, as `hull_kernels` reads it."""
-    rows = []
-    ray_from_pixel = np.linalg.inv(target.K)
-    for camera in cameras:
-        A = camera.R @ target.R.T @ ray_from_pixel
-        b = camera.R @ (target.center - camera.center)
-        K = camera.K
-        lens = [K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2], *camera.distortion]
-        rows.append([*A.ravel(), *b, *lens, *_extent(camera), *camera.size])
-    return np.array(rows, np.float32)
+    """(C, 27) float32 how rays of the target map to every camera, as `hull_kernels` reads it."""
+    scales = np.array([[_largest_scale(camera)] for camera in cameras], np.float32)
+    return np.concatenate([pack_cameras(target, cameras), scales], axis=1)
 
 
-def _extent(camera: Camera) -> tuple[float, float]:
-    """Largest squared radius on the image plane that the picture reaches, most pixels per unit of it.
-
-    A strong negative k1 folds rays from far outside back into the picture; they stop at the radius.
-    """
+def _largest_scale(camera: Camera) -> float:
+    """Most pixels per unit of the image plane."""
     width, height = camera.size
     x, y = np.meshgrid(np.linspace(-0.5, width - 0.5, 17), np.linspace(-0.5, height - 0.5, 17))
     plane = camera.rays(np.stack([x, y], axis=-1))[..., :2]
     small = 1e-4 * max(width, height) / camera.focal_px
     center = camera.pixels_from_normalized(plane)
     moved = [camera.pixels_from_normalized(plane + small * np.array(d)) - center for d in ((1, 0), (0, 1))]
-    scale = np.linalg.svd(np.stack(moved, axis=-1) / small, compute_uv=False).max()
-    return float((plane**2).sum(axis=-1).max()) * 1.02, float(scale)
+    return float(np.linalg.svd(np.stack(moved, axis=-1) / small, compute_uv=False).max())
 
 
 def pack_silhouettes(masks: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Silhouettes one after the other, for `hull_kernels`.
 
-    masks: (h, w) uint8, 255 moving, 0 background, anything between unknown
+    masks: (h, w) uint8; what is neither MOVING nor BACKGROUND is unknown
     Returns flat uint8 classes, flat float32 distances in px to the next pixel of another class or beyond
     the border, and (C,) int64 where each begins.
     """
     classes, distances = [], []
     for mask in masks:
-        kind = np.full(mask.shape, UNKNOWN, np.uint8)
-        kind[mask == 255] = MOVING
-        kind[mask == 0] = BACKGROUND
+        kind = np.where((mask == MOVING) | (mask == BACKGROUND), mask, np.uint8(UNKNOWN))
         distance = np.zeros(mask.shape, np.float32)
         for value in (UNKNOWN, MOVING, BACKGROUND):
             same = np.pad(kind == value, 1).astype(np.uint8)
@@ -299,18 +288,6 @@ def _refine(
     s = np.float32(top) - (first + level) * np.float32(step)
     s = np.clip(s, last, front).astype(np.float32)
     return s, (spread * np.float32(step / 2)).astype(np.float32)
-
-
-def fill_with_hull(
-    depth: np.ndarray, depth_source: np.ndarray, hull: HullDepth
-) -> tuple[np.ndarray, np.ndarray]:
-    """Put the hull where stereo has no consensus.
-
-    depth: (H, W) float32 z, NaN = blank;  depth_source: (H, W) uint8, 0 none, 1 stereo
-    Returns copies of both, with the hull's depth and 2 where there was none and the hull has some.
-    """
-    fill = ~(depth > 0) & (hull.depth > 0)
-    return np.where(fill, hull.depth, depth), np.where(fill, np.uint8(2), depth_source)
 
 
 def _check(

@@ -1,16 +1,19 @@
 """Compiled loops of the visual hull: march along target rays, compare patches inside, smooth. One core.
 
 A point on the ray of target pixel (u, v) at inverse depth s is at q = A @ [u, v, 1] + s * b on the image
-plane of a source (homogeneous), and at lens(q) in its picture. A row of `views` is A (9, row by row),
-b (3), fx, skew, cx, fy, cy, distortion (5), largest squared radius, pixels per unit of the image plane
-at most, width, height. Pictures of all sources lie one after the other in flat arrays, so that one
-compiled function serves any number of them; `starts` says where each begins.
+plane of a source (homogeneous), and at lens(q) in its picture. A row of `views` is one of
+`geometry.pack_cameras`, then the pixels per unit of the image plane at most. Pictures of all sources lie
+one after the other in flat arrays, so that one compiled function serves any number of them; `starts` says
+where each begins.
 """
 
 import numpy as np
 from numba import njit
 
-BACKGROUND, UNKNOWN, MOVING, UNSEEN = 0, 1, 2, 3
+from fourd.silhouettes.options import BACKGROUND, MOVING, UNKNOWN
+
+# Of a point that is in no picture: no class of a mask.
+UNSEEN = 1
 MAX_INTERVALS = 4
 _NEVER = np.float32(np.inf)
 _ONE = np.float32(1)
@@ -34,7 +37,7 @@ def ray_in_source(views, c, u, v):
 @njit(inline="always")
 def pixel_in_source(views, c, x, y):
     """Lens and intrinsics: image-plane coordinates at z = 1 to px."""
-    k1, k2, p1, p2, k3 = views[c, 17], views[c, 18], views[c, 19], views[c, 20], views[c, 21]
+    k1, k2, p1, p2, k3 = views[c, 21], views[c, 22], views[c, 23], views[c, 24], views[c, 25]
     r2 = x * x + y * y
     radial = _ONE + r2 * (k1 + r2 * (k2 + r2 * k3))
     xd = x * radial + (p1 + p1) * x * y + p2 * (r2 + (x * x + x * x))
@@ -63,14 +66,14 @@ def _look(views, c, classes, distances, start, ray, s, radius):
     inverse = _ONE / q2
     x, y = (ray[0] + s * e0) * inverse, (ray[1] + s * e1) * inverse
     px, py, r2 = pixel_in_source(views, c, x, y)
-    right, bottom, scale = views[c, 24] - _HALF, views[c, 25] - _HALF, views[c, 23]
+    right, bottom, scale = views[c, 19] + _HALF, views[c, 20] + _HALF, views[c, 26]
     reach, least = _ONE, _HALF
-    if r2 > views[c, 22]:
+    if r2 > views[c, 17]:
         # Beyond the lens' range pixels mean nothing; the image plane does.
         seen = UNSEEN
-        reach = (np.sqrt(r2) - np.sqrt(views[c, 22])) * scale
+        reach = (np.sqrt(r2) - np.sqrt(views[c, 17])) * scale
     elif (px >= -_HALF) & (px < right) & (py >= -_HALF) & (py < bottom):
-        at = start + int(py + _HALF) * int(views[c, 24]) + int(px + _HALF)
+        at = start + int(py + _HALF) * (int(views[c, 19]) + 1) + int(px + _HALF)
         seen = classes[at]
         reach = distances[at] - _PIXEL_DIAGONAL
     else:
@@ -137,7 +140,7 @@ def _poll(views, classes, distances, starts, rays, s, radius, rules, steps):
 def carve_rays(views, classes, distances, starts, grid, ranges, least, rules, intervals, votes):
     """Intervals of target rays inside the hull, nearest first.
 
-    views: (C, 26) float32;  classes: flat uint8;  distances: flat float32, px to the next pixel of another
+    views: (C, 27) float32;  classes: flat uint8;  distances: flat float32, px to the next pixel of another
     class or beyond the border;  starts: (C,)
     grid: position of the first ray, distance between rays and `radius` of `_look`, px
     ranges: (H, W, 2) float32, greatest and least inverse depth of every ray, NaN = not wanted
@@ -190,10 +193,10 @@ def rank_cameras(views, classes, starts, centers, pixel, s, order, angles):
             continue
         x, y = (ray[0] + s * views[c, 9]) / q2, (ray[1] + s * views[c, 10]) / q2
         px, py, r2 = pixel_in_source(views, c, x, y)
-        outside = (px < _ZERO) | (px > views[c, 24] - _ONE) | (py < _ZERO) | (py > views[c, 25] - _ONE)
-        if outside | (r2 > views[c, 22]):
+        outside = (px < _ZERO) | (px > views[c, 19]) | (py < _ZERO) | (py > views[c, 20])
+        if outside | (r2 > views[c, 17]):
             continue
-        if classes[starts[c] + int(py + _HALF) * int(views[c, 24]) + int(px + _HALF)] == BACKGROUND:
+        if classes[starts[c] + int(py + _HALF) * (int(views[c, 19]) + 1) + int(px + _HALF)] == BACKGROUND:
             continue
         # Times s, the vectors from the source and from the target to the point.
         ex, ey, ez = dx - s * centers[c, 0], dy - s * centers[c, 1], dz - s * centers[c, 2]

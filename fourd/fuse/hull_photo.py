@@ -33,8 +33,8 @@ def _place(views, c, u, v, s):
     px, py, r2 = pixel_in_source(
         views, c, (d0 + s * views[c, 9]) * inverse, (d1 + s * views[c, 10]) * inverse
     )
-    inside = (px >= _ZERO) & (px <= views[c, 24] - _ONE) & (py >= _ZERO) & (py <= views[c, 25] - _ONE)
-    return px, py, inside & (q2 > _ZERO) & (r2 <= views[c, 22])
+    inside = (px >= _ZERO) & (px <= views[c, 19]) & (py >= _ZERO) & (py <= views[c, 20])
+    return px, py, inside & (q2 > _ZERO) & (r2 <= views[c, 17])
 
 
 @njit(inline="always")
@@ -60,7 +60,7 @@ def _take_patch(views, c, greys, start, u, v, s, patch):
     right_x, right_y, _ = _place(views, c, u + _ONE, v, s)
     down_x, down_y, _ = _place(views, c, u, v + _ONE, s)
     ux, uy, vx, vy = right_x - px, right_y - py, down_x - px, down_y - py
-    width, height = int(views[c, 24]), int(views[c, 25])
+    width, height = int(views[c, 19]) + 1, int(views[c, 20]) + 1
     total = _ZERO
     at = 0
     for j in range(-REACH, REACH + 1):

@@ -14,7 +14,7 @@ from numba import njit
 BLANK = np.float32(-1)
 _ZERO = np.float32(0)
 # Samples are compared in groups of this many, which fill vector registers.
-_LANES = 8
+LANES = 8
 _LOW_BITS = np.uint32(0xFFFFFFFF)
 
 
@@ -51,11 +51,11 @@ def merge_maps(left, right, tolerance, layer):
 
 
 @njit(cache=True, nogil=True)
-def _gather_sorted(layers, y, x, masks, keys, t, variance, cameras):
+def gather_sorted(layers, y, x, masks, keys, t, variance, cameras):
     """Samples of one pixel, the greatest key first: t, squared sigma, cameras. Returns their number.
 
-    The last four are scratch, longer than the layers by `_LANES` at least. Whatever follows the
-    samples up to a multiple of `_LANES` agrees with nothing: its variance is NaN. No branch depends on
+    The last four are scratch, longer than the layers by `LANES` at least. Whatever follows the
+    samples up to a multiple of `LANES` agrees with nothing: its variance is NaN. No branch depends on
     a sample, because nobody could predict it.
     """
     number = np.uint64(0)
@@ -65,7 +65,7 @@ def _gather_sorted(layers, y, x, masks, keys, t, variance, cameras):
         cameras[number] = masks[p]
         number += np.uint64(key > 0)
     count = np.int64(number)
-    for k in range(_LANES):
+    for k in range(LANES):
         keys[count + k] = 0
     for i in range(1, count):
         key, mask = keys[i], cameras[i]
@@ -75,8 +75,8 @@ def _gather_sorted(layers, y, x, masks, keys, t, variance, cameras):
             keys[j], cameras[j] = (key if closer else held), (mask if closer else its_mask)
             key, mask = (held if closer else key), (its_mask if closer else mask)
         keys[i], cameras[i] = key, mask
-    for first in range(0, count, _LANES):
-        for k in range(_LANES):
+    for first in range(0, count, LANES):
+        for k in range(LANES):
             t[first + k], sigma = _unpack(keys[first + k])
             variance[first + k] = sigma * sigma
     return count
@@ -89,12 +89,12 @@ def _agree(difference, variances, squared):
 
 
 @njit(cache=True, nogil=True)
-def _support(t, variance, cameras, count, index, squared):
+def support(t, variance, cameras, count, index, squared):
     """Samples that agree with one: how many, and the cameras of their pairs."""
     number, union = 0, np.uint64(0)
     here, spread = t[index], variance[index]
-    for first in range(0, count, _LANES):
-        for k in range(_LANES):
+    for first in range(0, count, LANES):
+        for k in range(LANES):
             agree = _agree(t[first + k] - here, spread + variance[first + k], squared)
             number += agree
             union |= cameras[first + k] if agree else np.uint64(0)
@@ -112,17 +112,30 @@ def _num_bits(mask):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fused(t, variance, count, index, squared):
-    """Precision-weighted mean of the samples that agree with one, summed closest first."""
-    here, spread = t[index], variance[index]
-    total, weights = _ZERO, _ZERO
-    for j in range(count):
-        difference = t[j] - here
-        agree = _agree(difference, spread + variance[j], squared)
-        weight = spread / variance[j]
-        total += weight * difference if agree else _ZERO
-        weights += weight if agree else _ZERO
-    return max(here + total / weights, _ZERO)
+def _shift_to_mean(t, variance, cameras, count, seed, min_cameras, squared):
+    """The consensus that starts at a sample and moves to the mean of what agrees with it, for as long as
+    that lets more agree. Source: Y. Cheng, "Mean Shift, Mode Seeking, and Clustering", 1995.
+
+    Returns its last place, the precision-weighted mean of what agrees with that, summed closest first, how
+    many agree, and the cameras of their pairs.
+    """
+    spread = variance[seed]
+    center, mean, number, union = t[seed], t[seed], 0, np.uint64(0)
+    while True:
+        total, weights = _ZERO, _ZERO
+        agreeing, mask = 0, np.uint64(0)
+        for j in range(count):
+            difference = t[j] - mean
+            agree = _agree(difference, spread + variance[j], squared)
+            weight = spread / variance[j]
+            total += weight * difference if agree else _ZERO
+            weights += weight if agree else _ZERO
+            agreeing += agree
+            mask |= cameras[j] if agree else np.uint64(0)
+        if agreeing <= number or _num_bits(mask) < min_cameras:
+            return center, mean, number, union
+        center, number, union = mean, agreeing, mask
+        mean = max(mean + total / weights, _ZERO)
 
 
 @njit(cache=True, nogil=True)
@@ -145,33 +158,37 @@ def reduce_layers(layers, masks, tolerance, max_front, rules, wanted, chosen, ca
     chosen: (4, h, W) float32 inverse depth;  cameras: (4, h, W) uint64 of the pairs that agree with it
     counts: (2, h, W) uint8 pairs and distinct cameras of the consensus (0 = blank); all three changed
 
+    The closest sample that enough pairs agree with lies before the surface, the farther the more pairs
+    there are, so the consensus moves on from there to the mean.
     A sample that agrees with the consensus is a measurement of the same surface, so closest, median
     and farthest take the consensus' depth and cameras there. Elsewhere they are the sample itself.
     """
     num_pairs, height, width = layers.shape
-    longest = num_pairs + 2 * _LANES
+    longest = num_pairs + 2 * LANES
     keys, near = np.empty(longest, np.int64), np.empty(longest, np.uint64)
     t, variance = np.empty(longest, np.float32), np.empty(longest, np.float32)
     squared = tolerance * tolerance
     for y in range(height):
         for x in range(width):
-            count = _gather_sorted(layers, y, x, masks, keys, t, variance, near)
+            count = gather_sorted(layers, y, x, masks, keys, t, variance, near)
             for e in range(4):
                 chosen[e, y, x] = BLANK
                 cameras[e, y, x] = np.uint64(0)
             counts[0, y, x] = counts[1, y, x] = np.uint8(0)
             if count == 0:
                 continue
-            seed, number, shared_mask = -1, 0, np.uint64(0)
+            seed = -1
             for i in range(count if count >= rules[0] else 0):
-                number, shared_mask = _support(t, variance, near, count, i, squared)
-                if number >= rules[0] and _num_bits(shared_mask) >= rules[1]:
+                number, mask = support(t, variance, near, count, i, squared)
+                if number >= rules[0] and _num_bits(mask) >= rules[1]:
                     front = np.float32(_num_in_front(t, variance, i, squared))
                     seed = -1 if front > max_front * np.float32(number) else i
                     break
-            shared = BLANK
+            center, shared, shared_mask = BLANK, BLANK, np.uint64(0)
             if seed >= 0:
-                shared = _fused(t, variance, count, seed, squared)
+                center, shared, number, shared_mask = _shift_to_mean(
+                    t, variance, near, count, seed, rules[1], squared
+                )
                 if wanted[0]:
                     chosen[0, y, x], cameras[0, y, x] = shared, shared_mask
                     counts[0, y, x], counts[1, y, x] = np.uint8(min(number, 255)), _num_bits(shared_mask)
@@ -180,11 +197,11 @@ def reduce_layers(layers, masks, tolerance, max_front, rules, wanted, chosen, ca
                     continue
                 index = 0 if e == 1 else ((count - 1) // 2 if e == 2 else count - 1)
                 for i in range(count - 1 if e == 3 and rules[2] > 1 else -1, -1, -1):
-                    if _support(t, variance, near, count, i, squared)[0] >= rules[2]:
+                    if support(t, variance, near, count, i, squared)[0] >= rules[2]:
                         index = i
                         break
-                if seed >= 0 and _agree(t[index] - t[seed], variance[index] + variance[seed], squared):
+                if seed >= 0 and _agree(t[index] - center, variance[index] + variance[seed], squared):
                     chosen[e, y, x], cameras[e, y, x] = shared, shared_mask
                 else:
                     chosen[e, y, x] = t[index]
-                    cameras[e, y, x] = _support(t, variance, near, count, index, squared)[1]
+                    cameras[e, y, x] = support(t, variance, near, count, index, squared)[1]

@@ -195,13 +195,15 @@ def reduce_pixel(
     """
     squared = F(rules.tolerance) * F(rules.tolerance)
 
-    def supporters(i: int) -> list[int]:
-        t, sigma, _ = samples[i]
+    def agreeing(t: Scalar, variance: Scalar) -> list[int]:
         return [
             j
             for j, (t_j, sigma_j, _) in enumerate(samples)
-            if (t_j - t) * (t_j - t) <= squared * (sigma * sigma + sigma_j * sigma_j)
+            if (t_j - t) * (t_j - t) <= squared * (variance + sigma_j * sigma_j)
         ]
+
+    def supporters(i: int) -> list[int]:
+        return agreeing(samples[i][0], samples[i][1] * samples[i][1])
 
     def cameras(members: list[int]) -> int:
         mask = 0
@@ -212,13 +214,23 @@ def reduce_pixel(
     result: list[tuple[Scalar, int, int]] = [(F(-1), 0, 0)] * 4
     if not samples:
         return result
+
+    def are_enough(members: list[int]) -> bool:
+        return len(members) >= rules.min_pairs and cameras(members).bit_count() >= rules.min_cameras
+
     consensus, surface = result[0], []
     for i in range(len(samples)):
         members = supporters(i)
-        if len(members) >= rules.min_pairs and cameras(members).bit_count() >= rules.min_cameras:
+        if are_enough(members):
             in_front = sum(1 for j in range(i) if j not in members)
             if not F(in_front) > F(rules.max_front) * F(len(members)):
-                consensus, surface = (_mean(samples, i, members), cameras(members), len(members)), members
+                variance = samples[i][1] * samples[i][1]
+                mean = _mean(samples, members, samples[i][0], variance)
+                shifted = agreeing(mean, variance)
+                while len(shifted) > len(members) and are_enough(shifted):
+                    members, mean = shifted, _mean(samples, shifted, mean, variance)
+                    shifted = agreeing(mean, variance)
+                consensus, surface = (mean, cameras(members), len(members)), members
             break
     far = [i for i in range(len(samples)) if len(supporters(i)) >= rules.farthest_min_pairs]
     picks = [0, (len(samples) - 1) // 2, far[-1] if far else len(samples) - 1]
@@ -232,11 +244,12 @@ def reduce_pixel(
     return result
 
 
-def _mean(samples: list[tuple[Scalar, Scalar, int]], i: int, members: list[int]) -> Scalar:
-    t, sigma, _ = samples[i]
+def _mean(
+    samples: list[tuple[Scalar, Scalar, int]], members: list[int], t: Scalar, variance: Scalar
+) -> Scalar:
     total, weights = F(0), F(0)
     for j in members:
-        weight = (sigma * sigma) / (samples[j][1] * samples[j][1])
+        weight = variance / (samples[j][1] * samples[j][1])
         total += weight * (samples[j][0] - t)
         weights += weight
     return max(t + total / weights, F(0))

@@ -265,7 +265,7 @@ def _reduce(
     picks[1] = torch.where(count > 0, 0, -1)
     picks[2] = torch.where(count > 0, (count - 1).clamp(min=0) // 2, -1)
     picks[3] = torch.where(picks[3] >= 0, picks[3], far)
-    chosen, cameras, counts = _gather_picks(picks, t, variance, masks, valid, squared)
+    chosen, cameras, counts = _gather_picks(picks, t, variance, masks, valid, rules)
     unwanted = ~torch.from_numpy(rules.wanted()).to(t.device)
     chosen[unwanted], cameras[unwanted] = -1.0, 0
     counts[:, unwanted[:1].expand(shape)] = 0
@@ -278,9 +278,10 @@ def _gather_picks(
     variance: torch.Tensor,
     masks: torch.Tensor,
     valid: torch.Tensor,
-    squared: float,
+    rules: FusionRules,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Depth, cameras and counts of the picked samples (4, h, W)."""
+    squared = _squared(rules.tolerance)
     chosen = torch.full(picks.shape, -1.0, device=t.device)
     cameras = torch.zeros(picks.shape, dtype=torch.int64, device=t.device)
     counts = torch.zeros((2, *picks.shape[1:]), dtype=torch.uint8, device=t.device)
@@ -289,16 +290,20 @@ def _gather_picks(
         index = picks[e].clamp(min=0)[None]
         picked = picks[e] >= 0
         center, spread = t.gather(0, index)[0], variance.gather(0, index)[0]
-        agree = valid & ((t - center) * (t - center) <= squared * (spread + variance)) & picked
+        agree = _agreeing(t, variance, center, spread, squared) & valid & picked
         cameras[e] = _cameras(agree, masks)
         chosen[e] = torch.where(picked, center, -1.0)
         if e == 0:
-            total, weights = torch.zeros_like(center), torch.zeros_like(center)
-            for j in range(t.shape[0]):
-                weight = torch.where(agree[j], spread / variance[j], 0.0)
-                total = total + torch.where(agree[j], weight * (t[j] - center), 0.0)
-                weights = weights + weight
-            chosen[e] = torch.where(picked, (center + total / weights).clamp(min=0), -1.0)
+            mean = _mean(t, variance, center, spread, agree)
+            better = picked
+            while better.any():
+                around = _agreeing(t, variance, mean, spread, squared) & valid & better
+                union = _cameras(around, masks)
+                better = (around.sum(0) > agree.sum(0)) & (_num_bits(union) >= rules.min_cameras)
+                shifted = _mean(t, variance, mean, spread, around)
+                center, mean = torch.where(better, mean, center), torch.where(better, shifted, mean)
+                agree, cameras[e] = torch.where(better, around, agree), torch.where(better, union, cameras[e])
+            chosen[e] = torch.where(picked, mean, -1.0)
             counts[0] = agree.sum(0).clamp(max=255).to(torch.uint8)
             counts[1] = _num_bits(cameras[e]).to(torch.uint8)
             seed, seed_variance, has_seed = center, spread, picked
@@ -308,6 +313,25 @@ def _gather_picks(
             chosen[e] = torch.where(same, chosen[0], chosen[e])
             cameras[e] = torch.where(same, cameras[0], cameras[e])
     return chosen, cameras, counts
+
+
+def _agreeing(
+    t: torch.Tensor, variance: torch.Tensor, center: torch.Tensor, spread: torch.Tensor, squared: float
+) -> torch.Tensor:
+    """(P, h, W) bool: what agrees with an inverse depth of variance `spread` (h, W)."""
+    return (t - center) * (t - center) <= squared * (spread + variance)
+
+
+def _mean(
+    t: torch.Tensor, variance: torch.Tensor, center: torch.Tensor, spread: torch.Tensor, agree: torch.Tensor
+) -> torch.Tensor:
+    """(h, W) precision-weighted mean of what agrees, summed in order (`reduce_kernels._shift_to_mean`)."""
+    total, weights = torch.zeros_like(center), torch.zeros_like(center)
+    for j in range(t.shape[0]):
+        weight = torch.where(agree[j], spread / variance[j], 0.0)
+        total = total + torch.where(agree[j], weight * (t[j] - center), 0.0)
+        weights = weights + weight
+    return (center + total / weights).clamp(min=0)
 
 
 def _cameras(agree: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
@@ -330,7 +354,7 @@ def _num_bits(mask: torch.Tensor) -> torch.Tensor:
 def _see(
     source: dict, u: torch.Tensor, v: torch.Tensor, t: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """x, y in px and cost, infinite where the source is unusable (`colour_kernels._place_row`)."""
+    """x, y in px and cost, infinite where the source is unusable (`colour_kernels.place_point`)."""
     A, b = source["A"], source["b"]
     fx, skew, cx, fy, cy, far, focal_ratio, right, bottom = source["lens"]
     k1, k2, p1, p2, k3 = source["distortion"]
@@ -357,7 +381,7 @@ def _see(
 
 
 def _bicubic(image: torch.Tensor, px: torch.Tensor, py: torch.Tensor) -> torch.Tensor:
-    """(N, 3) float32 RGB; edges repeat (`colour_kernels._sample`)."""
+    """(N, 3) float32 RGB; edges repeat (`colour_kernels.sample_bicubic`)."""
     height, width = image.shape[:2]
     x, y = px.to(torch.int64), py.to(torch.int64)
     wx, wy = _keys(px - x.to(torch.float32)), _keys(py - y.to(torch.float32))

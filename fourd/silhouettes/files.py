@@ -12,11 +12,7 @@ from fourd.io import Archive, ArchiveWriter
 from fourd.silhouettes.options import SilhouetteOptions
 from fourd.silhouettes.plate import MIN_SAMPLES, Plate, estimate_plate, turned_plate
 from fourd.silhouettes.segment import find_unrest
-
-
-def spread(count: int, wanted: int) -> list[int]:
-    """At most `wanted` of the numbers 0..count - 1, evenly spread, the ends included."""
-    return sorted({int(round(p)) for p in np.linspace(0, count - 1, min(count, max(wanted, 1)))})
+from fourd.views import spread
 
 
 def read_background_film(path: Path, size: tuple[int, int], num_samples: int) -> list[np.ndarray]:
@@ -31,7 +27,7 @@ def read_background_film(path: Path, size: tuple[int, int], num_samples: int) ->
                 f"{size[1]} like the camera's own, got {reader.size[0]} x {reader.size[1]}: film it anew "
                 "with the same settings, or leave it out"
             )
-        return [reader.read(frame) for frame in spread(reader.num_frames, num_samples)]
+        return [reader.read(frame) for frame in spread(range(reader.num_frames), num_samples)]
 
 
 def write_plate(
@@ -45,7 +41,7 @@ def write_plate(
 
     Raises InputError for a film of the empty scene given to a camera that moves.
     """
-    frames = spread(film.num_frames, options.num_samples)
+    frames = spread(range(film.num_frames), options.num_samples)
     meta = {"camera": film.camera, "status": "ok", "made_from": "own frames", "frames": frames}
     if background_film is not None and not track.is_static:
         raise InputError(

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fourd.background import BackgroundOptions
-from fourd.background.__main__ import find_equal_poses, main, spread
+from fourd.background.__main__ import find_equal_poses, main
 from fourd.background.colour import Opinions, settle_colours
-from fourd.background.fill import drop_speckles, fill_holes
-from fourd.background.project import pack_cameras
+from fourd.background.fill import drop_ghosts, drop_speckles, fill_holes
 from fourd.background.surfaces import Surfaces, find_surfaces
 from fourd.background.visibility import find_hidden
 from fourd.background.vote import StaticDepth, vote_depth
 from fourd.errors import InputError
+from fourd.fuse.geometry import pack_cameras
 from fourd.io import Archive, read_json, write_json
 from fourd.views import read_view
 from tests.unit.fuse_scene import (
@@ -211,6 +211,42 @@ def test_noise_around_infinity_is_no_speckle():
     np.testing.assert_array_equal(depth, expected)
 
 
+def scene_with_patch(depth: float, num_seen: int) -> tuple[np.ndarray, np.ndarray]:
+    """A wall at inverse depth 0.2 seen at all of 7 times, in it a patch seen at some of them."""
+    inverse_depth = np.full((20, 30), 0.2, np.float32)
+    inverse_depth[5:12, 8:15] = depth
+    seen_by = np.full((7, 20, 30), ABC, np.uint64)
+    seen_by[num_seen:, 5:12, 8:15] = 0
+    return inverse_depth, seen_by
+
+
+@pytest.mark.parametrize(
+    ("depth", "num_seen", "is_ghost"),
+    [(0.5, 2, True), (0.1, 2, True), (0.5, 3, False), (0.201, 1, False)],
+)
+def test_what_is_seen_rarely_and_continues_nothing_is_a_ghost(depth, num_seen, is_ghost):
+    inverse_depth, seen_by = scene_with_patch(depth, num_seen)
+    expected = inverse_depth.copy()
+    assert drop_ghosts(inverse_depth, seen_by) == (49 if is_ghost else 0)
+    if is_ghost:
+        expected[5:12, 8:15] = -1
+    np.testing.assert_array_equal(inverse_depth, expected)
+    assert np.array_equal(seen_by.any(axis=0), expected >= 0)
+
+
+def test_a_ghost_against_a_wall_seen_as_rarely_does_not_take_the_wall_with_it():
+    inverse_depth, seen_by = scene_with_patch(0.5, 2)
+    seen_by[1:, 5:12, 4:8] = 0
+    drop_ghosts(inverse_depth, seen_by)
+    assert (inverse_depth[5:12, 8:15] == -1).all() and (inverse_depth < 0).sum() == 49
+
+
+def test_what_is_seen_rarely_stays_where_nothing_else_is_known():
+    inverse_depth, seen_by = scene_with_patch(0.5, 1)
+    inverse_depth[seen_by[1] > 0] = -1
+    assert drop_ghosts(inverse_depth, seen_by) == 0
+
+
 def test_a_known_surface_hides_what_is_behind_it_from_the_other_side():
     cameras = {"cam00": make_camera(-1.0), "cam01": make_camera(1.0)}
     target = make_camera(0.0)
@@ -218,12 +254,12 @@ def test_a_known_surface_hides_what_is_behind_it_from_the_other_side():
     near = x.ravel(), y.ravel(), np.full(x.size, 1 / 2.5, np.float32)
     far_x = np.arange(24, dtype=np.float32)
     far = far_x, np.full(24, 8.5, np.float32), np.full(24, 1 / 4.0, np.float32)
-    hidden = find_hidden(*far, near, pack_cameras(target, cameras), [SIZE, SIZE])
+    hidden = find_hidden(*far, near, pack_cameras(target, list(cameras.values())), [SIZE, SIZE])
     from_left, from_right = hidden & np.uint64(1) > 0, hidden & np.uint64(2) > 0
     # Looking from the left, what is to the right of the block lies behind it.
     assert far_x[from_left].mean() > 12 > far_x[from_right].mean()
     assert 3 <= from_left.sum() <= 9 and 3 <= from_right.sum() <= 9
-    assert not find_hidden(*near, near, pack_cameras(target, cameras), [SIZE, SIZE]).any()
+    assert not find_hidden(*near, near, pack_cameras(target, list(cameras.values())), [SIZE, SIZE]).any()
 
 
 def test_no_width_fills_nothing():
@@ -241,17 +277,6 @@ def test_colour_is_the_weighted_median_and_blank_without_opinions():
     assert colours.tolist() == [[14, 14, 14], [0, 0, 0]] and valid.tolist() == [True, False]
     weight[1, :, 0] = 5
     assert settle_colours(opinions)[0][0].tolist() == [200, 200, 200]
-
-
-@given(st.integers(1, 40), st.integers(1, 40))
-def test_spread_is_even_and_has_the_ends(num_frames, count):
-    frames = list(range(100, 100 + num_frames))
-    chosen = spread(frames, count)
-    assert len(chosen) == len(set(chosen)) == min(count, num_frames)
-    assert chosen == sorted(chosen) and set(chosen) <= set(frames)
-    if min(count, num_frames) > 1:
-        assert chosen[0] == frames[0] and chosen[-1] == frames[-1]
-        assert np.diff(chosen).max() - np.diff(chosen).min() <= 1
 
 
 def run_stage_on(folder: Path, *words: str, view: str = "orbit", frames: str = "0 1") -> Archive:

@@ -189,7 +189,7 @@ def test_sigma_grows_with_the_square_of_depth_and_falls_with_confidence():
         pair, left_confidence=pair.left_confidence / 2, right_confidence=pair.right_confidence * 0
     )
     backend.layer(0, maps_of_pair(half, rotated), (0, SIZE[1]))
-    keys = backend._layers[0]
+    keys = backend.layers[0]
     sigma = (0xFFFFFFFF - (keys[keys > 0] & 0xFFFFFFFF)).astype(np.uint32).view(np.float32)
     expected = 0.25 / 0.5 * pair.inverse_depth_per_px[0]
     assert sigma.size
@@ -281,6 +281,13 @@ def test_consensus_is_the_precision_weighted_mean_of_the_closest_supported_depth
     chosen, _, counts = reduce_with_kernel(with_masks([(F(t), F(s)) for t, s in samples]), RULES)
     assert counts[0] == 3
     np.testing.assert_allclose(chosen[0], (2 + 2.004 / 4 + 1.996 / 4) / 1.5, rtol=1e-6)
+
+
+def test_more_pairs_do_not_draw_the_consensus_towards_the_camera():
+    noise = np.random.default_rng(2).normal(0, 0.01, 60)
+    rules = dataclasses.replace(RULES, tolerance=2.0)
+    chosen, _, counts = reduce_with_kernel(with_masks([(F(2 + n), F(0.01)) for n in noise]), rules)
+    assert chosen[0] == pytest.approx(2 + noise.mean(), abs=1e-5) and counts[0] == len(noise)
 
 
 def test_consensus_behind_too_many_other_samples_is_blank():

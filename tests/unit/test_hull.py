@@ -9,7 +9,7 @@ import pytest
 
 from fourd.camera import Camera
 from fourd.errors import InputError
-from fourd.fuse.hull import HullDepth, HullOptions, carve_view, fill_with_hull
+from fourd.fuse.hull import HullDepth, HullOptions, carve_view
 from fourd.geometry import look_at
 
 SIZE = (160, 120)
@@ -239,17 +239,6 @@ def test_lens_distortion_is_followed() -> None:
     inside = inner(np.isfinite(truth))
     assert np.isfinite(hull.depth[inside]).all()
     assert np.median(np.abs(hull.depth[inside] / truth[inside] - 1)) < 0.01
-
-
-def test_hull_fills_only_what_stereo_leaves() -> None:
-    depth = np.array([[2.0, np.nan], [np.nan, np.inf]], np.float32)
-    source = np.array([[1, 0], [0, 1]], np.uint8)
-    carved = np.array([[3.0, 4.0], [np.nan, 5.0]], np.float32)
-    hull = HullDepth(carved, carved * 0.01, np.full((2, 2), 3, np.uint8), "ok")
-    filled, filled_source = fill_with_hull(depth, source, hull)
-    assert np.array_equal(filled, np.array([[2, 4], [np.nan, np.inf]], np.float32), equal_nan=True)
-    assert np.array_equal(filled_source, [[1, 2], [0, 1]])
-    assert np.isnan(depth[0, 1])
 
 
 def test_faults_are_named() -> None:

@@ -21,19 +21,9 @@ from fourd.stability.case import (
 )
 
 CASES = all_cases()
-# Known to be bad; one that gets better must leave this list.
-KNOWN = {
-    "thirty cameras": "three pairs out of hundreds agree on an edge nearer than the surface",
-}
 
 
-def as_test(case):
-    reason = KNOWN.get(case.name)
-    marks = [] if reason is None else [pytest.mark.xfail(reason=reason, strict=True)]
-    return pytest.param(case, id=f"{case.group}-{case.name.replace(' ', '_')}", marks=marks)
-
-
-@pytest.mark.parametrize("case", [as_test(case) for case in CASES])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.group}-{case.name.replace(' ', '_')}")
 def test_case(case):
     outcome = run_case(case).outcome
     assert outcome.verdict in (RIGHT, REFUSED), outcome.got

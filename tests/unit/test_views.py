@@ -2,6 +2,8 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fourd import cli, views
 from fourd.camera import Camera, CameraTrack
@@ -149,3 +151,14 @@ def test_damaged_view_files_are_named(tmp_path, change):
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     with pytest.raises(InputError, match="cam00.json"):
         views.read_view(path)
+
+
+@given(st.integers(1, 40), st.integers(1, 40))
+def test_spread_is_even_and_has_the_ends(num_frames, count):
+    frames = list(range(100, 100 + num_frames))
+    chosen = views.spread(frames, count)
+    assert len(chosen) == len(set(chosen)) == min(count, num_frames)
+    assert chosen == sorted(chosen) and set(chosen) <= set(frames)
+    if min(count, num_frames) > 1:
+        assert chosen[0] == frames[0] and chosen[-1] == frames[-1]
+        assert np.diff(chosen).max() - np.diff(chosen).min() <= 1
