@@ -1,14 +1,15 @@
 """Error against time of the matcher's settings, on rectified pairs with true disparity.
 
-    python -m benches.stereo --data DIR --output DIR
+    python -m benches.stereo --data DIR --output DIR [--psmnet WEIGHTS]
 
 Every folder below DATA that holds view1.png, view5.png and disp1.png, or im2.png, im6.png and
 disp2.png, is a pair; disp is an 8-bit image of disparity times 3 or 4 (Middlebury 2003, 2005).
 Writes stereo.csv: one row per setting, means over the pairs, as they are and (unlike_*) with gain,
 gamma, noise and JPEG on the right image, and (turned_*) with the right camera rolled and tilted by 0.1
-degrees; stereo.png: the front; reliability.csv and reliability.png: expected against actual
-error. Errors of the reliability are cut at 2 px. Of the true disparities of Middlebury pairs only the
-share that both images show (85 %) can be matched; density counts all of them.
+degrees; stereo.png: the front; reliability.csv and reliability.png: expected against actual error.
+With --psmnet there is a row for the learned matcher, half a minute a pair on a processor. Errors of the
+reliability are cut at 2 px. Of the true disparities of Middlebury pairs only the share that both images
+show (85 %) can be matched; density counts all of them.
 """
 
 import argparse
@@ -31,27 +32,29 @@ from fourd.stereo.disparity import PairDisparity, StereoOptions, find_row_shift,
 from fourd.stereo.rectify import Rectification
 
 LAYOUTS = (("view1.png", "view5.png", "disp1.png", 3), ("im2.png", "im6.png", "disp2.png", 4))
+SGBM = {"matcher": "sgbm"}
 SETTINGS = {
     "default": {},
     "unrefined": {"is_refined": False},
-    "census": {"matcher": "census"},
-    "hh4": {"sgbm_mode": "hh4"},
-    "hh4_dense": {"sgbm_mode": "hh4", "sgbm_uniqueness_percent": 0, "max_left_right_px": 2.0},
-    "hh": {"sgbm_mode": "hh"},
-    "sgbm": {"sgbm_mode": "sgbm"},
-    "block3": {"sgbm_block_size_px": 3, "sgbm_penalty_small": 4, "sgbm_penalty_large": 32},
-    "block5": {"sgbm_block_size_px": 5, "sgbm_penalty_small": 4, "sgbm_penalty_large": 32},
-    "smooth": {"sgbm_penalty_small": 8, "sgbm_penalty_large": 96},
-    "rough": {"sgbm_penalty_small": 4, "sgbm_penalty_large": 16},
-    "unique10": {"sgbm_uniqueness_percent": 10},
     "left_right_1px": {"max_left_right_px": 1.0},
+    "left_right_2px": {"max_left_right_px": 2.0},
     "support_11px_50": {"support_px": 11, "min_support": 0.5},
+    "census": {"matcher": "census"},
+    "sgbm": SGBM,
+    "sgbm_hh4": SGBM | {"sgbm_mode": "hh4"},
+    "sgbm_hh4_dense": SGBM | {"sgbm_mode": "hh4", "sgbm_uniqueness_percent": 0, "max_left_right_px": 2.0},
+    "sgbm_hh": SGBM | {"sgbm_mode": "hh"},
+    "sgbm_5way": SGBM | {"sgbm_mode": "sgbm"},
+    "sgbm_block3": SGBM | {"sgbm_block_size_px": 3, "sgbm_penalty_small": 4, "sgbm_penalty_large": 32},
+    "sgbm_smooth": SGBM | {"sgbm_penalty_small": 8, "sgbm_penalty_large": 96},
+    "sgbm_rough": SGBM | {"sgbm_penalty_small": 4, "sgbm_penalty_large": 16},
+    "sgbm_unique10": SGBM | {"sgbm_uniqueness_percent": 10},
 }
 UNLIKE_SETTINGS = {
     "unlike_default": {},
     "unlike_plain": {"match_tones": False},
     "unlike_census": {"matcher": "census"},
-    "unlike_hh4": {"sgbm_mode": "hh4"},
+    "unlike_sgbm": SGBM,
 }
 TURNED_SETTINGS = {"turned_default": {}, "turned_unaligned": {"align_rows": False}}
 TURN_DEG = 0.1
@@ -198,6 +201,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--psmnet", type=Path, help="weights of the learned matcher")
     args = parser.parse_args(argv)
     cv2.setNumThreads(1)
     pairs = list(find_pairs(args.data))
@@ -210,14 +214,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     measure(pairs[:1], StereoOptions())
     rows = []
     turned = [make_turned(pair) for pair in pairs]
-    for settings, data in ((SETTINGS, pairs), (UNLIKE_SETTINGS, unlike), (TURNED_SETTINGS, turned)):
+    plain = dict(SETTINGS)
+    if args.psmnet is not None:
+        plain["psmnet"] = {"matcher": "psmnet", "network_file": str(args.psmnet)}
+    for settings, data in ((plain, pairs), (UNLIKE_SETTINGS, unlike), (TURNED_SETTINGS, turned)):
         for name, changes in settings.items():
             rows.append({"setting": name} | measure(data, dataclasses.replace(StereoOptions(), **changes)))
             print(
                 "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{v:16s}" for k, v in rows[-1].items())
             )
     io.write_csv(args.output / "stereo.csv", COLUMNS, rows)
-    plot_front(args.output / "stereo.png", rows[: len(SETTINGS)], "setting", "default")
+    plot_front(args.output / "stereo.png", rows[: len(plain)], "setting", "default")
     reliability = measure_reliability(pairs, StereoOptions())
     for row in reliability:
         print("  ".join(f"{key} {value:.3f}" for key, value in row.items()))

@@ -29,7 +29,10 @@ class CensusMatcher:
     def match(self, left: np.ndarray, right: np.ndarray, disparity_range: tuple[float, float]) -> Match:
         """See `Matcher.match`."""
         lowest, highest = math.floor(disparity_range[0]) - 1, math.ceil(disparity_range[1]) + 1
-        ours, theirs = (_census(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in (left, right))
+        ours, theirs = (
+            census(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _HALF_WIDTH_PX, _HALF_HEIGHT_PX)
+            for image in (left, right)
+        )
         cost = _smooth(_hamming(ours, theirs, lowest, highest - lowest + 1))
         index = best_hypothesis(aggregate(cost, _PENALTY_SMALL, _PENALTY_LARGE))
         disparity = (index + lowest).astype(np.float32)
@@ -37,19 +40,22 @@ class CensusMatcher:
 
 
 @numba.njit(cache=True, nogil=True)
-def _census(grey: np.ndarray) -> np.ndarray:
-    """(H, W) uint64: one bit for every neighbour that is darker than the centre; borders repeat."""
+def census(grey: np.ndarray, half_width: int, half_height: int) -> np.ndarray:
+    """One bit for every neighbour that is darker than the pixel; borders repeat.
+
+    grey: (H, W) uint8;  half_width, half_height: of the window, px, at most 64 neighbours
+    Returns (H, W) uint64
+    """
     height, width = grey.shape
     signature = np.zeros((height, width), np.uint64)
     for y in range(height):
-        for x in range(width):
-            bits = np.uint64(0)
-            for v in range(-_HALF_HEIGHT_PX, _HALF_HEIGHT_PX + 1):
-                row = min(max(y + v, 0), height - 1)
-                for u in range(-_HALF_WIDTH_PX, _HALF_WIDTH_PX + 1):
+        for v in range(-half_height, half_height + 1):
+            row = min(max(y + v, 0), height - 1)
+            for u in range(-half_width, half_width + 1):
+                for x in range(width):
                     column = min(max(x + u, 0), width - 1)
-                    bits = (bits << np.uint64(1)) | np.uint64(grey[row, column] < grey[y, x])
-            signature[y, x] = bits
+                    darker = np.uint64(grey[row, column] < grey[y, x])
+                    signature[y, x] = (signature[y, x] << np.uint64(1)) | darker
     return signature
 
 

@@ -8,58 +8,96 @@ Source: H. Hirschmueller, "Stereo Processing by Semiglobal Matching and Mutual I
 import numba
 import numpy as np
 
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _step_along_path(
-    before: np.ndarray, cost: np.ndarray, small: int, large: int, path: np.ndarray, total: np.ndarray
-) -> None:
-    """One pixel of one path: `path` from the pixel before it, added to `total`.
-
-    before, path: (D + 2,) int16 with a large number at both ends;  cost: (D,) uint8
-    """
-    count = cost.size
-    least = before[1]
-    for d in range(2, count + 1):
-        least = min(least, before[d])
-    jump = least + large
-    for d in range(count):
-        best = min(min(before[d + 1], jump), min(before[d], before[d + 2]) + small)
-        path[d + 1] = cost[d] + best - least
-        total[d] += path[d + 1]
+_FAR = np.int16(20000)
+_i16 = np.int16
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def aggregate(cost: np.ndarray, small: int, large: int) -> np.ndarray:
     """Costs summed along eight paths that end in each pixel (semi-global matching).
 
-    cost: (H, W, D) uint8;  small, large: penalty for a step of one hypothesis, and of more
+    cost: (H, W, D) uint8, or int16 of at most 4000 less the larger penalty
+    small, large: penalty for a step of one hypothesis, and of more
     Returns (H, W, D) int16
     """
     height, width, count = cost.shape
+    step, jump = _i16(small), _i16(large)
     total = np.zeros((height, width, count), np.int16)
-    far = np.int16(20000)
-    for reverse in (False, True):
-        # Paths of the row above, from up-left, up and up-right, with a blank column at both ends.
-        above = np.zeros((3, width + 2, count + 2), np.int16)
-        here = np.zeros((3, width + 2, count + 2), np.int16)
-        along = np.zeros((2, count + 2), np.int16)
-        for array in (above, here):
-            array[:, :, 0] = far
-            array[:, :, count + 1] = far
-        along[:, 0] = far
-        along[:, count + 1] = far
+    # Paths of two rows, from up-left, up and up-right, with a blank column and hypothesis at both ends.
+    paths = np.empty((3, 2, width + 2, count + 2), np.int16)
+    line = np.empty((2, count + 2), np.int16)
+    least = np.empty((3, 2, width + 2), np.int16)
+    for forward in (True, False):
+        paths[:] = 0
+        least[:] = 0
+        for array in (paths[..., 0], paths[..., count + 1]):
+            array[:] = _FAR
         for i in range(height):
-            row = height - 1 - i if reverse else i
-            along[:, 1 : count + 1] = 0
-            for j in range(width):
-                column = width - 1 - j if reverse else j
-                at, sums = cost[row, column], total[row, column]
-                _step_along_path(along[j % 2], at, small, large, along[(j + 1) % 2], sums)
-                for path in range(3):
-                    # Mirrored, up-left is down-right: the offset holds in scan order.
-                    _step_along_path(above[path, j + path], at, small, large, here[path, j + 1], sums)
-            above, here = here, above
+            y = i if forward else height - 1 - i
+            _path_along(forward, cost[y], step, jump, line, total[y])
+            a, b = i % 2, (i + 1) % 2
+            for k in range(3):
+                # In the second pass the row before is the one below, and its up-left is down-right.
+                shift = k - 1 if forward else 1 - k
+                _path_down(
+                    paths[k, a], least[k, a], shift, cost[y], step, jump, paths[k, b], least[k, b], total[y]
+                )
     return total
+
+
+# Sums are cast to 16 bits at every step, or the compiler would calculate with 64.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _path_down(
+    before: np.ndarray,
+    least_before: np.ndarray,
+    shift: int,
+    cost: np.ndarray,
+    small: np.int16,
+    large: np.int16,
+    path: np.ndarray,
+    least: np.ndarray,
+    total: np.ndarray,
+) -> None:
+    """A row of paths, from the row before and columns off by `shift`, to `path`, and added to `total`."""
+    width, count = cost.shape
+    for x in range(width):
+        from_column = x + 1 + shift
+        lowest = least_before[from_column]
+        jump = _i16(lowest + large)
+        least_here = _i16(32000)
+        for d in range(count):
+            step = _i16(min(before[from_column, d], before[from_column, d + 2]) + small)
+            best = min(min(before[from_column, d + 1], jump), step)
+            value = _i16(_i16(cost[x, d]) + _i16(best - lowest))
+            path[x + 1, d + 1] = value
+            total[x, d] = _i16(total[x, d] + value)
+            least_here = min(least_here, value)
+        least[x + 1] = least_here
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _path_along(
+    forward: bool, cost: np.ndarray, small: np.int16, large: np.int16, line: np.ndarray, total: np.ndarray
+) -> None:
+    """A path along a row, added to `total`."""
+    width, count = cost.shape
+    line[:] = 0
+    line[:, 0] = _FAR
+    line[:, count + 1] = _FAR
+    lowest = _i16(0)
+    for i in range(width):
+        x = i if forward else width - 1 - i
+        here, there = i % 2, (i + 1) % 2
+        jump = _i16(lowest + large)
+        least = _i16(32000)
+        for d in range(count):
+            step = _i16(min(line[here, d], line[here, d + 2]) + small)
+            best = min(min(line[here, d + 1], jump), step)
+            value = _i16(_i16(cost[x, d]) + _i16(best - lowest))
+            line[there, d + 1] = value
+            total[x, d] = _i16(total[x, d] + value)
+            least = min(least, value)
+        lowest = least
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -79,4 +117,21 @@ def best_hypothesis(total: np.ndarray) -> np.ndarray:
                 curvature = before + after - 2 * np.float32(at[d])
                 shift = (before - after) / (2 * curvature) if curvature > 0 else np.float32(0)
                 best[row, column] = d + shift
+    return best
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def least_index(total: np.ndarray) -> np.ndarray:
+    """(H, W) int16 index of the least cost, the first of equal ones."""
+    height, width, count = total.shape
+    best = np.zeros((height, width), np.int16)
+    for y in range(height):
+        for x in range(width):
+            least = total[y, x, 0]
+            for d in range(count):
+                least = min(least, total[y, x, d])
+            for d in range(count):
+                if total[y, x, d] == least:
+                    best[y, x] = d
+                    break
     return best

@@ -1,4 +1,4 @@
-"""Semi-global block matching, OpenCV's StereoSGBM: the default, on every machine.
+"""Semi-global block matching, OpenCV's StereoSGBM: the fastest where disparities are few.
 
 Source: H. Hirschmueller, "Stereo Processing by Semiglobal Matching and Mutual Information",
 PAMI 2008; the cost is that of S. Birchfield and C. Tomasi, "A Pixel Dissimilarity Measure That Is

@@ -28,7 +28,7 @@ _MIN_CONFIDENCE = 0.1
 class StereoOptions:
     """How a rectified pair is matched, checked and trusted. Defaults are measured (benches/stereo.py)."""
 
-    matcher: str = "sgbm"
+    matcher: str = "pyramid"
     sgbm_mode: str = "3way"
     sgbm_block_size_px: int = 1
     sgbm_penalty_small: int = 8

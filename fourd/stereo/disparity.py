@@ -16,7 +16,7 @@ from fourd.stereo.normalise import match_tones
 from fourd.stereo.rectify import Rectification, sampling_maps
 from fourd.stereo.rows import RowShift, measure_rows
 
-MATCHERS = ("sgbm", "census", "psmnet", "network")
+MATCHERS = ("pyramid", "sgbm", "census", "psmnet", "network")
 _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
 
 # Both sides of a pair whose cameras stand still have the same maps in every frame.
@@ -55,6 +55,10 @@ def make_matcher(options: StereoOptions) -> Matcher:
                 options.sgbm_uniqueness_percent,
             )
         )
+    if options.matcher == "pyramid":
+        from fourd.matchers.pyramid import PyramidMatcher
+
+        return PyramidMatcher()
     if options.matcher == "census":
         from fourd.matchers.census import CensusMatcher
 

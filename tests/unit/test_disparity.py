@@ -184,7 +184,8 @@ def test_image_of_another_size_is_refused():
 
 
 @pytest.mark.parametrize(
-    "change, message", [({"matcher": "psychic"}, "stereo matcher"), ({"sgbm_mode": "x"}, "sgbm_mode")]
+    "change, message",
+    [({"matcher": "psychic"}, "stereo matcher"), ({"matcher": "sgbm", "sgbm_mode": "x"}, "sgbm_mode")],
 )
 def test_unknown_matcher_is_refused_by_name(change, message):
     with pytest.raises(InputError, match=message):
