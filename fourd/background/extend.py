@@ -53,7 +53,7 @@ def _large_regions(unknown: np.ndarray) -> np.ndarray:
     _, labels, stats, _ = cv2.connectedComponentsWithStats(unknown.astype(np.uint8), connectivity=8)
     is_large = stats[:, cv2.CC_STAT_AREA] >= LEAST_REGION * unknown.size
     is_large[0] = False
-    return np.take(is_large, labels)
+    return is_large[np.asarray(labels, np.int64)]
 
 
 def _fit_planes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,12 +15,15 @@ from fourd.camera import camera_from_dict
 from fourd.demo.options import DemoOptions, camera_names
 from fourd.demo.phones import SAMPLE_RATE, write_phone_file
 from fourd.demo.truth import describe_phones
-from fourd.film_cameras import read_film_cameras
+from fourd.film_cameras import FilmCamera, read_film_cameras
 from fourd.io import read_json
 from fourd.sfm.cameras import read_cameras
 from fourd.sfm.compare import align_similarity
+from fourd.sfm.recover.options import RecoverOptions
+from fourd.sfm.recover.recover import recover_cameras
 from fourd.video import read_video_frames
 from tests.conftest import Workspace
+from tests.unit.recover_films import film_of
 
 EVENT = DemoOptions(num_cameras=5, num_frames=18, width=320, height=180, arc_deg=44, samples_per_axis=1)
 GOOD = tuple(camera_names(EVENT))
@@ -103,8 +107,8 @@ def test_clocks_are_within_a_quarter_frame(finished: Workspace) -> None:
         assert clocks[name].sigma_s < 0.25 / 30
 
 
-def test_cameras_are_where_they_were(finished: Workspace) -> None:
-    films = read_film_cameras(results(finished) / "sfm" / "film_cameras.json").cameras
+def check_cameras(films: Mapping[str, FilmCamera]) -> None:
+    """All frames of the good films are where they were."""
     phones = describe_phones(EVENT)["phones"]
     found, true = [], []
     for name in GOOD:
@@ -115,9 +119,28 @@ def test_cameras_are_where_they_were(finished: Workspace) -> None:
             found.append(camera)
             true.append(camera_from_dict(phones[name]["frames"][int(frame)], camera.size, name))
     errors = align_similarity(found, true)
-    assert np.median(errors.rotation_deg) < 0.2
-    assert np.median(errors.center / errors.distance) < 0.006
-    assert np.abs(errors.focal).max() < 0.01
+    assert np.median(errors.rotation_deg) < 0.12
+    assert np.median(errors.center / errors.distance) < 0.002
+    assert np.abs(errors.focal).max() < 0.005
+
+
+def test_cameras_are_where_they_were(finished: Workspace) -> None:
+    check_cameras(read_film_cameras(results(finished) / "sfm" / "film_cameras.json").cameras)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_little_noise_moves_no_camera(finished: Workspace, seed: int) -> None:
+    """Noise of a grey level or two changes every corner and match, as another processor changes a few."""
+    rng = np.random.default_rng(seed)
+    films = {}
+    for name in GOOD:
+        count = len(describe_phones(EVENT)["phones"][name]["frames"])
+        pictures = [
+            image for _, image in read_video_frames(finished.folder / f"films/{name}.mp4", range(count))
+        ]
+        noisy = [image + np.rint(rng.normal(0, 1.5, image.shape)) for image in pictures]
+        films[name] = film_of(name, [np.clip(image, 0, 255).astype(np.uint8) for image in noisy])
+    check_cameras(recover_cameras(films, [HELDOUT], None, RecoverOptions()).cameras)
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -13,12 +13,13 @@ from fourd.sfm.compare import align_similarity, fit_similarity
 from fourd.sfm.recover.adjust import adjust
 from fourd.sfm.recover.diagnose import describe_geometry
 from fourd.sfm.recover.evidence import choose_lens, sub_model
-from fourd.sfm.recover.frames import bridge_gaps, longest_run
+from fourd.sfm.recover.features import find_features
+from fourd.sfm.recover.frames import adjust_films, bridge_gaps, longest_run
 from fourd.sfm.recover.mapping import Features, map_keyframes, match_keyframes
 from fourd.sfm.recover.model import Lens, Model, to_reconstruction
 from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.recover.patches import align_patches, extract_templates
-from fourd.sfm.recover.register import register_remaining
+from fourd.sfm.recover.register import register_remaining, replace_poses
 from fourd.sfm.recover.tracking import affine_between, cut_landmarks
 from fourd.sfm.sparse import detect_features
 from tests.unit.recover_films import draw_films, make_cameras
@@ -268,3 +269,41 @@ def test_centres_that_coincide_leave_only_the_rotation():
     camera = Camera(np.diag([300.0, 300, 1]), R, t, (320, 240))
     errors = align_similarity([camera, camera], [camera, camera])
     assert errors.rotation_deg.max() < 1e-9 and errors.extent == 0
+
+
+def test_a_picture_in_a_wrong_pose_is_placed_anew_and_the_others_stay():
+    model, _ = make_model(noise_px=0.2)
+    wrong = model.images[3]
+    step = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix()
+    poses = {k: step @ pose if k == wrong else pose for k, pose in model.poses.items()}
+    found = replace_poses(dataclasses.replace(model, poses=poses), 1.0)
+    assert list(found.poses) == model.images
+    for key, pose in model.poses.items():
+        if key == wrong:
+            np.testing.assert_allclose(found.poses[key], pose, atol=5e-3)
+        else:
+            np.testing.assert_array_equal(found.poses[key], pose)
+
+
+def test_landmarks_off_to_one_side_in_all_frames_of_a_film_do_not_turn_the_cameras():
+    model, _ = make_model(noise_px=0.02)
+    truth = [make_model()[0].camera(key) for key in model.images]
+    off = np.zeros_like(model.obs_px)
+    off[(model.obs_image >= 4) & (model.obs_point % 4 == 0)] = [0.0, 0.5]
+    bent = adjust(dataclasses.replace(model, obs_px=model.obs_px + off), 0.3)
+    errors = [
+        np.median(align_similarity([m.camera(key) for key in m.images], truth).rotation_deg)
+        for m in (bent, adjust_films(bent, RecoverOptions()))
+    ]
+    assert errors[0] > 0.1
+    assert errors[1] < 0.03
+
+
+def test_a_picture_with_few_corners_gives_its_weak_ones_too():
+    texture = cv2.GaussianBlur(make_texture(256), (0, 0), 1.5)
+    faint = np.clip(128 + 0.6 * (texture.astype(np.float64) - 128), 0, 255).astype(np.uint8)
+    strong, _ = detect_features(faint, 4000)
+    assert len(find_features(faint, RecoverOptions()).pixels) > 2 * len(strong)
+    # Where as many are allowed as there are strong ones, these stay alone.
+    enough = RecoverOptions(max_features=len(strong))
+    np.testing.assert_array_equal(find_features(faint, enough).pixels, strong)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from fourd.geometry import nearest_rotation
-from fourd.sfm.recover.adjust import adjust, with_lenses
+from fourd.sfm.recover.adjust import adjust, drop_outliers, with_lenses
 from fourd.sfm.recover.model import LENS_MODELS, Lens, Model
 
 MIN_LENS_GAIN = 0.2
@@ -53,12 +53,14 @@ def choose_lens(model: Model, loss_scale_px: float) -> Lens:
     return lens
 
 
-def choose_lenses(model: Model, loss_scale_px: float) -> Model:
+def choose_lenses(model: Model, loss_scale_px: float, max_error_px: float) -> Model:
     """The model with the distortion that each camera's observations ask for, adjusted.
 
-    Points are first fitted with the richest lens everywhere, so that they favour none.
+    Points are first fitted with the richest lens everywhere, so that they favour none, and observations
+    beyond `max_error_px` of that are dropped: a coefficient gains most by bending towards them.
     """
     rich = adjust(with_lenses(model, len(LENS_MODELS) - 1), loss_scale_px)
+    rich = drop_outliers(rich, max_error_px)
     if model.is_lens_shared:
         lenses = dict.fromkeys(model.lenses, choose_lens(rich, loss_scale_px))
     else:

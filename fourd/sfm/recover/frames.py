@@ -10,10 +10,16 @@ from fourd.sfm.recover.adjust import adjust, drop_outliers
 from fourd.sfm.recover.films import Film
 from fourd.sfm.recover.model import ImageKey, Model
 from fourd.sfm.recover.options import RecoverOptions
+from fourd.sfm.recover.patches import STEP_TOLERANCE_PX
 from fourd.sfm.recover.tracking import FilmTrack, Landmarks, refine_pose, track_film
 
 MAX_GAP = 3
 GRID = (8, 6)
+# Most landmarks are measured to hundredths of a pixel, while those on edges of depth or in gloss are
+# tenths off, to one side in all frames of a film, so that more frames do not average it away.
+LOSS_PER_MEDIAN = 0.4
+# Starting from adjusted keyframes the joint adjustment has settled by then.
+MAX_JOINT_ITERATIONS = 30
 
 
 def film_landmarks(model: Model, name: str, count: int) -> np.ndarray:
@@ -69,21 +75,29 @@ def track_films(
 
 
 def adjust_films(model: Model, options: RecoverOptions) -> Model:
-    """All pictures adjusted jointly, or evenly spread `max_adjusted_frames` of them, then the rest."""
+    """All pictures adjusted jointly, or evenly spread `max_adjusted_frames` of them, then the rest.
+
+    The loss follows the observations: its scale is `LOSS_PER_MEDIAN` of the median residual, at most
+    `loss_scale_px`. Common errors of all cameras hardly change their residuals, so the few landmarks that
+    are far off would decide them.
+    """
     total = len(model.poses)
     count = min(total, options.max_adjusted_frames)
     chosen = np.zeros(total, dtype=bool)
     chosen[np.linspace(0, total - 1, count).round().astype(int)] = True
-    part = adjust(_subset(model, chosen).supported(), options.loss_scale_px)
+    part = _subset(model, chosen).supported()
+    median_px = float(np.nanmedian(np.linalg.norm(part.residuals_px(), axis=1)))
+    scale_px = min(options.loss_scale_px, max(LOSS_PER_MEDIAN * median_px, STEP_TOLERANCE_PX))
+    part = adjust(part, scale_px, MAX_JOINT_ITERATIONS)
     adjusted = dataclasses.replace(
         model, lenses=part.lenses, poses={**model.poses, **part.poses}, points=part.points
     )
     if count < total:
-        adjusted = refine_poses(adjusted, ~chosen, options)
+        adjusted = refine_poses(adjusted, ~chosen, scale_px)
     return drop_outliers(adjusted, options.max_error_px)
 
 
-def refine_poses(model: Model, chosen: np.ndarray, options: RecoverOptions) -> Model:
+def refine_poses(model: Model, chosen: np.ndarray, loss_scale_px: float) -> Model:
     """The model with the poses of the chosen (N,) bool pictures fitted to the points as they are."""
     poses = dict(model.poses)
     edges, order = _by_image(model)
@@ -92,7 +106,7 @@ def refine_poses(model: Model, chosen: np.ndarray, options: RecoverOptions) -> M
             rows = order[edges[i] : edges[i + 1]]
             points = model.points[model.obs_point[rows]]
             lens = model.lenses[image[0]]
-            poses[image] = refine_pose(poses[image], model.obs_px[rows], points, lens, options.loss_scale_px)
+            poses[image] = refine_pose(poses[image], model.obs_px[rows], points, lens, loss_scale_px)
     return dataclasses.replace(model, poses=poses)
 
 

@@ -103,10 +103,12 @@ def map_keyframes(
     pairs: Sequence[VerifiedPair],
     lenses: Mapping[str, Lens],
     options: RecoverOptions,
+    seed: int = SEED,
 ) -> list[Model]:
     """Models that COLMAP's incremental mapper finds, the one with most cameras first.
 
-    lenses: start of the intrinsics, one COLMAP camera per name, or one for all if the options say so.
+    lenses: start of the intrinsics, one COLMAP camera per name, or one for all if the options say so
+    seed: of the mapper's random samples
     Deterministic: one thread, fixed seed.
     """
     keys = sorted(features)
@@ -114,7 +116,10 @@ def map_keyframes(
     with tempfile.TemporaryDirectory() as folder:
         _write_database(Path(folder) / "database.db", keys, features, pairs, lenses, camera_ids)
         found = pycolmap.incremental_mapping(
-            Path(folder) / "database.db", Path(folder), Path(folder) / "models", _pipeline_options(options)
+            Path(folder) / "database.db",
+            Path(folder),
+            Path(folder) / "models",
+            _pipeline_options(options, seed),
         )
     models = [
         dataclasses.replace(_model_of(found[i], keys, lenses, camera_ids), is_lens_shared=options.shared_lens)
@@ -123,10 +128,10 @@ def map_keyframes(
     return sorted(models, key=lambda m: (-len(m.cameras), -len(m.poses), -len(m.points)))
 
 
-def _pipeline_options(options: RecoverOptions) -> pycolmap.IncrementalPipelineOptions:
+def _pipeline_options(options: RecoverOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.num_threads = 1
-    pipeline.random_seed = SEED
+    pipeline.random_seed = seed
     pipeline.extract_colors = False
     pipeline.min_model_size = 2
     pipeline.min_num_matches = options.min_matches

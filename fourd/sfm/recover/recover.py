@@ -36,13 +36,21 @@ from fourd.sfm.recover.frames import (
 from fourd.sfm.recover.mapping import VerifiedPair, map_keyframes, match_keyframes
 from fourd.sfm.recover.model import ImageKey, Lens, Model
 from fourd.sfm.recover.options import RecoverOptions
-from fourd.sfm.recover.register import describe_landmarks, register_film, register_remaining
+from fourd.sfm.recover.register import (
+    describe_landmarks,
+    register_film,
+    register_remaining,
+    replace_poses,
+)
 from fourd.sfm.recover.tracking import Landmarks, cut_landmarks, observe, refine_pose
 
 log = logging.getLogger(__name__)
 
 # A model counts as better explained by distortion only if that gains this share of observations.
 DISTORTION_GAIN = 1.05
+# A mapper that starts from an unlucky pair ends in pieces; it starts anew while pictures that match
+# those of another camera are missing.
+MAX_STARTS = 6
 
 
 def recover_cameras(
@@ -131,15 +139,47 @@ def _map(
     lenses: Mapping[str, Lens],
     options: RecoverOptions,
 ) -> list[Model]:
-    """Models of the keyframes. A distorting lens is tried too: without it a mapper loses the corners."""
-    plain = map_keyframes(features, pairs, lenses, options)
-    radial = {name: dataclasses.replace(lens, radial=(0.0,)) for name, lens in lenses.items()}
-    distorted = map_keyframes(features, pairs, radial, options)
-    if not plain or not distorted:
-        return plain or distorted
-    sizes = [(len(m[0].cameras), len(m[0].poses)) for m in (plain, distorted)]
-    gain = len(distorted[0].obs_px) / len(plain[0].obs_px)
+    """Models of the keyframes, the first one adjusted.
+
+    A distorting lens is tried too: without it a mapper loses the corners. Only adjusted models compare:
+    the mapper's own leave observations to chance.
+    """
+    linked = {key for pair in pairs if pair.left[0] != pair.right[0] for key in (pair.left, pair.right)}
+    found = []
+    for seed in range(1, MAX_STARTS + 1):
+        tried = []
+        for radial in ((), (0.0,)):
+            start = {name: dataclasses.replace(lens, radial=radial) for name, lens in lenses.items()}
+            models = map_keyframes(features, pairs, start, options, seed)
+            tried += [[_adjust_corners(models[0], options), *models[1:]]] if models else []
+        if not found or _most_observed(tried) > _most_observed(found):
+            found = tried
+        if any(linked <= set(models[0].poses) for models in found):
+            break
+    if len(found) < 2:
+        return found[0] if found else []
+    plain, distorted = found
+    sizes = [(len(m[0].cameras), len(m[0].poses)) for m in found]
+    gain = len(distorted[0].obs_px) / max(1, len(plain[0].obs_px))
     return distorted if sizes[1] > sizes[0] or (sizes[1] == sizes[0] and gain > DISTORTION_GAIN) else plain
+
+
+def _most_observed(tried: Sequence[Sequence[Model]]) -> tuple[int, int]:
+    """Pictures and observations of the largest first model."""
+    return max(((len(models[0].poses), len(models[0].obs_px)) for models in tried), default=(0, 0))
+
+
+def _adjust_corners(model: Model, options: RecoverOptions) -> Model:
+    """The mapper's model, adjusted, without outliers and with no picture in a pose it cannot leave.
+
+    A model of one camera supports no point and stays as it is.
+    """
+    if len(model.cameras) < 2:
+        return model
+    scale_px = options.max_match_error_px / 3
+    model = replace_poses(adjust(model, scale_px), options.max_error_px)
+    model = adjust(drop_outliers(model, options.max_match_error_px), scale_px)
+    return model.supported().compact()
 
 
 def _check_models(
@@ -193,13 +233,10 @@ def _refine_keyframes(
     model: Model, films: Mapping[str, Film], options: RecoverOptions
 ) -> tuple[Model, Landmarks]:
     """The keyframes' model measured anew by patches, with lenses by evidence, and its landmarks."""
-    model = adjust(model, options.max_match_error_px / 3)
-    model = adjust(drop_outliers(model, options.max_match_error_px), options.max_match_error_px / 3)
-    model = model.supported().compact()
     read_gray = gray_reader(films)
     landmarks = cut_landmarks(model, read_gray, options.patch_radius_px)
     model = observe(model, landmarks, read_gray, model.images, options.min_patch_score).supported()
-    model = choose_lenses(model, options.loss_scale_px)
+    model = choose_lenses(model, options.loss_scale_px, options.max_error_px)
     model = adjust(drop_outliers(model, options.max_error_px), options.loss_scale_px)
     model = choose_principal_points(model, options.loss_scale_px)
     cameras = tuple(model.camera(image) for image in model.images)

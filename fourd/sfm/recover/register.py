@@ -18,6 +18,24 @@ from fourd.sfm.recover.tracking import Landmarks, estimate_pose, observe
 SAME_CORNER_PX = 1.0
 
 
+def replace_poses(model: Model, max_error_px: float) -> Model:
+    """The model with those pictures placed anew that fit the points of the others better elsewhere.
+
+    A mapper that has only a few points yet may place a picture degrees off; the pose is a minimum of its
+    own, which no adjustment leaves. The pose within `max_error_px` of more points is kept.
+    """
+    poses = dict(model.poses)
+    residual = np.linalg.norm(model.residuals_px(), axis=1)
+    is_seen_twice_more = np.bincount(model.obs_point, minlength=len(model.points))[model.obs_point] > 2
+    for i, image in enumerate(model.images):
+        rows = np.flatnonzero((model.obs_image == i) & is_seen_twice_more)
+        points, lens = model.points[model.obs_point[rows]], model.lenses[image[0]]
+        found = estimate_pose(model.obs_px[rows], points, lens, max_error_px)
+        if found is not None and found[2].sum() > (residual[rows] <= max_error_px).sum():
+            poses[image] = found[0]
+    return dataclasses.replace(model, poses=poses)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class DescribedLandmarks:
     """Those of one keyframe's features that are landmarks.
