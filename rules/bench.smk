@@ -25,6 +25,24 @@ rule stability:
         "python -m fourd.stability --output $(dirname {output.table}) 2> {log}"
 
 
+rule bench_stereo:
+    output:
+        "<results>/bench/stereo/stereo.csv",
+    log:
+        "<logs>/bench_stereo.log",
+    benchmark:
+        "<benchmarks>/bench_stereo.tsv"
+    conda:
+        "../envs/torch.yaml"
+    threads: 1
+    params:
+        pairs=flags_from_mapping({"data": config["bench_pairs"]}),
+        version=fourd_config.stage_version("stereo"),
+    shell:
+        "PYTHONPATH={workflow.basedir} python -m benches.stereo {params.pairs}"
+        " --output $(dirname {output}) > {log} 2>&1"
+
+
 # Against truth, with the true cameras of the event.
 if SCENE.name == "demo_known":
 
