@@ -20,6 +20,7 @@ include: "rules/background.smk"
 include: "rules/composition.smk"
 include: "rules/render.smk"
 include: "rules/evaluate.smk"
+include: "rules/report.smk"
 include: "rules/bench.smk"
 
 

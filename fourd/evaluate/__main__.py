@@ -23,17 +23,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     camera.add_argument("--foreground", type=Path, nargs="+", required=True)
     camera.add_argument("--background", type=Path, nargs="+", required=True)
     camera.add_argument("--labels", type=Path, help="folder of this camera's true masks")
+    camera.add_argument("--points", type=Path, help="sfm/points.npz")
     cli.add_options(camera, EvaluateOptions)
     collect = commands.add_parser("collect", help="join the scores of all held-out cameras")
     collect.add_argument("--inputs", type=Path, nargs="+", required=True)
     collect.add_argument("--sheets", type=Path, nargs="+", required=True)
+    collect.add_argument("--output-summary", type=Path, required=True)
     collect.add_argument("--output-table", type=Path, required=True)
     for command in (camera, collect):
         command.add_argument("--output", type=Path, required=True)
         command.add_argument("--output-sheet", type=Path, required=True)
     args = parser.parse_args(argv)
     if args.command == "collect":
-        print(run_collect(args.inputs, args.sheets, args.output, args.output_table, args.output_sheet))
+        outputs = (args.output, args.output_summary, args.output_table, args.output_sheet)
+        print(run_collect(args.inputs, args.sheets, *outputs))
         return
     sources = Sources(
         args.view_file,
@@ -43,6 +46,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         tuple(args.foreground),
         tuple(args.background),
         args.labels,
+        args.points,
     )
     cli.set_num_threads(1)
     run_camera(sources, args.output, args.output_sheet, cli.options_from_args(EvaluateOptions, args))

@@ -1,4 +1,8 @@
-"""Where something moves in a held-out frame: from true masks, or from what no still picture explains."""
+"""Parts of a held-out frame: what moves, what the inputs see, what is only inferred.
+
+What moves comes from true masks, or from what no still picture explains; the others come from the
+workflow's own estimates for the view.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fourd.baselines import Evidence
 from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.evaluate import EvaluateOptions
@@ -61,6 +66,25 @@ class StillPicture:
 def _moved(camera: Camera, to: Camera) -> Camera:
     """The camera with its own direction at another camera's centre."""
     return dataclasses.replace(camera, t=-camera.R @ to.center)
+
+
+def surface_regions(evidence: Evidence) -> dict[str, np.ndarray]:
+    """(H, W) bool: `seen_1`, `seen_2` and `inferred`.
+
+    seen_N: pixels whose surface, by the depth of the consensus or else of the background, lies in
+    the pictures of N inputs and is not hidden there by another surface of the view, or was agreed
+    on by pairs of that many cameras. What hides it outside the view is not known.
+    inferred: pixels that no estimate covers, or that only the background covers, by depth continued
+    from around a hole (`filled`).
+    """
+    near, far = evidence.foreground["consensus_valid"], evidence.background["farthest_valid"]
+    agreed = np.where(near, evidence.foreground["num_cameras"], np.uint8(0))
+    num_seen = np.maximum(evidence.warp.num_seen, agreed)
+    return {
+        "seen_1": num_seen >= 1,
+        "seen_2": num_seen >= 2,
+        "inferred": ~near & (~far | evidence.background["filled"]),
+    }
 
 
 def find_dynamic_pixels(

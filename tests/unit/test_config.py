@@ -32,6 +32,7 @@ OPTIONS = {
     "composition": "fourd.composition.CompositionOptions",
     "render": "fourd.render.RenderOptions",
     "evaluate": "fourd.evaluate.EvaluateOptions",
+    "report": "fourd.report.ReportOptions",
 }
 
 

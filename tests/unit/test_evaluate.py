@@ -1,6 +1,7 @@
 import csv
 import dataclasses
 import math
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -9,14 +10,13 @@ import pytest
 import yaml
 
 from fourd import cli, io, metrics, views
-from fourd.baselines import METHODS, Evidence, nn_same_time
+from fourd.baselines import METHODS
 from fourd.camera import Camera, CameraTrack
 from fourd.errors import InputError
-from fourd.evaluate import EvaluateOptions, contact_sheet, regions, table
+from fourd.evaluate import EvaluateOptions, contact_sheet, summary, table
 from fourd.evaluate.__main__ import main
 from fourd.evaluate.camera import COLUMNS, score_image
 from fourd.geometry import look_at
-from fourd.image import undistort
 from fourd.sfm import SceneCameras, write_cameras
 from tests.films import put_on_clock
 
@@ -75,14 +75,23 @@ def make_estimates(folder: Path) -> None:
             near = np.zeros((64, 96), bool)
             near[16:40, 8:72] = True
             image = filmed(HELDOUT, frame) * near[..., None].astype(np.uint8)
-            writer.add_frame(frame, consensus_rgb=image, consensus_valid=near)
+            writer.add_frame(
+                frame,
+                consensus_rgb=image,
+                consensus_valid=near,
+                depth=np.where(near, np.float32(4.8), np.float32(np.nan)),
+                num_cameras=np.full((64, 96), 3, np.uint8),
+            )
     with io.ArchiveWriter(
         folder / "background.npz", {"view": HELDOUT, "same_as": {"1": 0, "2": 0}}
     ) as writer:
         place = texture(2)
         seen = np.ones((64, 96), bool)
         seen[:8] = False
-        writer.add_frame(0, farthest_rgb=place, farthest_valid=seen)
+        filled = np.zeros_like(seen)
+        filled[40:, 90:] = True
+        depth = np.full((64, 96), 5, np.float32)
+        writer.add_frame(0, farthest_rgb=place, farthest_valid=seen, depth=depth, filled=filled)
     for frame in range(3):
         rendered = np.clip(filmed(HELDOUT, frame).astype(int) - 3, 0, 255).astype(np.uint8)
         io.write_png(folder / "rendered" / f"{frame:06d}.png", rendered)
@@ -102,6 +111,8 @@ def scene(tmp_path_factory):
     make_scene(folder)
     make_estimates(folder)
     make_labels(folder)
+    with io.ArchiveWriter(folder / "points.npz") as writer:
+        writer.add("points", np.random.default_rng(0).uniform(-1, 1, (300, 3)))
     return folder
 
 
@@ -113,11 +124,13 @@ def camera_command(folder: Path, output: Path, **changes) -> list[str]:
         "foreground": folder / "foreground.npz",
         "background": folder / "background.npz",
         "labels": folder / "labels",
+        "points": folder / "points.npz",
         **{key.replace("_", "-"): value for key, value in changes.items()},
     }
     command = ["camera", "--films", *(f"{name}={folder / name}.json" for name in NAMES)]
     for key, value in files.items():
-        command += [] if value is None else [f"--{key}", str(value)]
+        words = value if isinstance(value, list) else [value]
+        command += [] if value is None else [f"--{key}", *map(str, words)]
     return [*command, "--output", str(output / "cam01.csv"), "--output-sheet", str(output / "cam01.png")]
 
 
@@ -135,15 +148,19 @@ def value_of(rows, method, region, metric, frame) -> float:
 def test_schema_and_options_agree():
     properties = yaml.safe_load(SCHEMA.read_text())["properties"]
     expected = {field.name: field.default for field in dataclasses.fields(EvaluateOptions)}
-    assert {key: entry["default"] for key, entry in properties.items()} == expected
+    assert {key: entry["default"] for key, entry in properties.items()} == expected | {"other": []}
 
 
 def test_one_camera_is_scored_by_every_method(scene, tmp_path):
     main(camera_command(scene, tmp_path))
     rows = read_rows(tmp_path / "cam01.csv")
     assert tuple(rows[0]) == COLUMNS
-    assert len(rows) == 3 * len(METHODS) * 2 * 3
-    assert {row["region_source"] for row in rows} == {"truth"}
+    assert set(Counter((row["frame"], row["method"]) for row in rows if row["value"]).values()) <= {15, 17}
+    sources = {row["region"]: row["region_source"] for row in rows}
+    assert sources == dict.fromkeys(("full", "static", "dynamic"), "truth") | dict.fromkeys(
+        ("seen_1", "seen_2", "inferred"), "pipeline"
+    )
+    assert list(dict.fromkeys(row["method"] for row in rows)) == list(METHODS)
     assert {row["view"] for row in rows} == {"cam01"}
     for frame in range(3):
         truth = filmed(HELDOUT, frame)
@@ -156,8 +173,69 @@ def test_one_camera_is_scored_by_every_method(scene, tmp_path):
         near = np.zeros((64, 96, 1), np.uint8)
         near[16:40, 8:72] = 1
         assert value_of(rows, "inst", "full", "mse", frame) == pytest.approx(metrics.mse(truth * near, truth))
-    counts = {row["num_pixels"] for row in rows if row["region"] == "dynamic"}
+    counts = {r["num_pixels"] for r in rows if r["region"] == "dynamic" and r["metric"] == "mse"}
     assert counts == {str(16 * 16)}
+    near, blank = 24 * 64, 8 * 96
+    inferred = {row["num_pixels"] for row in rows if row["region"] == "inferred" and row["value"]}
+    assert inferred == {str(blank + 24 * 6)}
+    for region in ("seen_1", "seen_2"):
+        counts = {int(row["num_pixels"]) for row in rows if row["region"] == region and row["value"]}
+        assert all(near <= count <= 64 * 96 - blank for count in counts)
+
+
+def test_flicker_counts_changes_that_the_truth_does_not_have(scene, tmp_path):
+    main(camera_command(scene, tmp_path))
+    rows = read_rows(tmp_path / "cam01.csv")
+    flicker = [row for row in rows if row["metric"] == "flicker"]
+    assert {row["frame"] for row in flicker} == {"1", "2"}
+    # A render that is 3 levels too dark in every frame does not flicker.
+    assert {float(r["value"]) for r in flicker if r["method"] == "ours"} == {0.0}
+    assert {r["num_pixels"] for r in flicker if r["region"] == "dynamic"} == {str(2 * 16 * 16)}
+    still = [float(r["value"]) for r in flicker if r["method"] == "background" and r["region"] == "dynamic"]
+    before, after = filmed(HELDOUT, 0).astype(float), filmed(HELDOUT, 1).astype(float)
+    moved = np.abs(after - before).mean(axis=2)[(np.abs(after - before) > 0).any(axis=2)]
+    assert still[0] == pytest.approx(moved.sum() / (2 * 16 * 16), rel=1e-5)
+    assert value_of(rows, "background", "static", "flicker", 1) == 0
+
+
+def test_every_value_that_is_missing_has_its_reason(scene, tmp_path):
+    main(camera_command(scene, tmp_path, points=None))
+    rows = read_rows(tmp_path / "cam01.csv")
+    missing = {(r["method"], r["metric"]): r["note"] for r in rows if not r["value"]}
+    assert all(missing.values())
+    assert missing["ours", "lpips_alex"].startswith("no weights are given: run `python -m fourd.fetch lpips")
+    assert missing["ours", "ms_ssim"] == "a side is under 176 px"
+    assert (
+        "no sparse points" in missing["sfm", "psnr_db"]
+        and "no sparse points" in missing["sfm_dense", "psnr_db"]
+    )
+    assert missing["sfm_humans", "psnr_db"] == "extra not installed: pose and body models"
+    notes = {row["note"] for row in rows if row["method"] == "nn_all_times" and row["value"]}
+    assert notes == {"feature: thumbnail and gradient histograms"}
+    text = table.draw_table(rows, summary.summarize_all(rows))
+    assert "| SfM+humans | - | - | - | - | - | - |" in text
+    assert "- SfM+humans: extra not installed: pose and body models" in text
+    assert "- LPIPS (AlexNet): no weights are given" in text
+    assert "- N.N. same-time, N.N. all-time: feature: thumbnail and gradient histograms" in text
+
+
+def test_renders_of_other_programs_are_scored_beside_ours(scene, tmp_path):
+    for frame in range(3):
+        image = np.clip(filmed(HELDOUT, frame).astype(int) - 6, 0, 255).astype(np.uint8)
+        io.write_png(tmp_path / "splats" / HELDOUT / f"{frame:06d}.png", image)
+    main(camera_command(scene, tmp_path, other=[f"splats={tmp_path / 'splats'}"]))
+    rows = read_rows(tmp_path / "cam01.csv")
+    assert value_of(rows, "splats", "full", "mse", 2) == 36
+    assert list(dict.fromkeys(row["method"] for row in rows))[-2:] == ["splats", "ours"]
+    (tmp_path / "splats" / HELDOUT / "000001.png").unlink()
+    with pytest.raises(InputError, match=r"every evaluated frame of cam01, but .*000001.png is missing"):
+        main(camera_command(scene, tmp_path, other=[f"splats={tmp_path / 'splats'}"]))
+    io.write_png(tmp_path / "splats" / HELDOUT / "000001.png", np.zeros((32, 48, 3), np.uint8))
+    with pytest.raises(InputError, match=r"pictures of \(96, 64\) px, got \(48, 32\)"):
+        main(camera_command(scene, tmp_path, other=[f"splats={tmp_path / 'splats'}"]))
+    for word in ("splats", "ours=x", "=x"):
+        with pytest.raises(InputError, match="expected NAME=FOLDER with a new name"):
+            main(camera_command(scene, tmp_path, other=[word]))
 
 
 def test_dynamic_region_without_labels_is_the_workflows_own(scene, tmp_path):
@@ -189,35 +267,37 @@ def test_collect_joins_cameras_into_table_and_sheet(scene, tmp_path, capsys):
     main(
         ["collect", "--inputs", str(tmp_path / "cam01.csv"), str(tmp_path / "cam07.csv")]
         + ["--sheets", str(tmp_path / "cam01.png"), str(tmp_path / "cam01.png")]
-        + ["--output", str(tmp_path / "metrics.csv"), "--output-table", str(tmp_path / "table.md")]
+        + ["--output", str(tmp_path / "metrics.csv"), "--output-summary", str(tmp_path / "summary.csv")]
+        + ["--output-table", str(tmp_path / "table.md")]
         + ["--output-sheet", str(tmp_path / "sheet.png")]
     )
     assert read_rows(tmp_path / "metrics.csv") == rows + other
     text = (tmp_path / "table.md").read_text()
     assert text in capsys.readouterr().out
-    assert "Full frame: mean and standard deviation over 6 frames of cam01, cam07" in text
+    assert "Full frame: mean and standard deviation over 6 frames of cam01, cam07, [95 % interval]" in text
     assert "Dynamic region (true masks)" in text
-    assert "| ours | 9.0 +- 0.0 | 38.59 +- 0.00 |" in text
+    assert "| ours | 9.0 +- 0.0 [9.0, 9.0] | 38.59 +- 0.00 [38.59, 38.59] |" in text
+    assert "| seen by an input (" in text.replace("Dynamic region (4.2%) | ", "| ")
+    summaries = {(r["region"], r["method"], r["metric"]): r for r in read_rows(tmp_path / "summary.csv")}
+    found = summaries["full", "ours", "mse"]
+    assert (float(found["mean"]), found["num_frames"], found["num_views"]) == (9, "6", "2")
+    assert summaries["full", "sfm_humans", "psnr_db"]["mean"] == ""
     assert "| method | cam01 | cam07 |" in text
     assert "nan" not in text
     single, joined = io.read_image(tmp_path / "cam01.png"), io.read_image(tmp_path / "sheet.png")
     assert joined.shape[0] > 2 * single.shape[0] and joined.shape[1] == single.shape[1]
 
 
-def test_summary_is_mean_and_sample_deviation():
-    assert table.summarize([1.0, 2.0, 6.0]) == pytest.approx((3.0, math.sqrt(7)))
-    assert table.summarize([4.0]) == (4.0, 0.0)
-    mean, deviation = table.summarize([1.0, math.inf])
-    assert mean == math.inf and math.isnan(deviation)
-
-
 def test_empty_region_is_written_as_nothing_not_as_nan(scene, tmp_path):
     for frame in range(3):
         io.write_png(tmp_path / "still" / f"{frame:06d}.png", np.zeros((64, 96), np.uint8))
     main(camera_command(scene, tmp_path, labels=tmp_path / "still"))
-    dynamic = [row for row in read_rows(tmp_path / "cam01.csv") if row["region"] == "dynamic"]
-    assert {(row["value"], row["num_pixels"]) for row in dynamic} == {("", "0")}
-    assert "| ours | - | - | - |" in table.draw_table(read_rows(tmp_path / "cam01.csv"))
+    rows = read_rows(tmp_path / "cam01.csv")
+    dynamic = [row for row in rows if row["region"] == "dynamic"]
+    assert {(row["value"], row["num_pixels"], row["note"]) for row in dynamic} == {
+        ("", "0", "the region is empty")
+    }
+    assert "| ours | - | - | - | - |" in table.draw_table(rows, summary.summarize_all(rows))
 
 
 def test_scores_equal_the_metrics():
@@ -232,83 +312,6 @@ def test_scores_equal_the_metrics():
     for metric, function in (("mse", metrics.mse), ("psnr_db", metrics.psnr), ("ssim", metrics.ssim)):
         assert scores["f", metric] == pytest.approx(function(image, truth), rel=1e-12)
         assert scores["d", metric] == pytest.approx(function(image, truth, region), rel=1e-12)
-
-
-def test_dynamic_pixels_ignore_small_shifts_and_blanks():
-    place = texture(2)
-    valid = np.ones((64, 96), bool)
-    valid[:, 80:] = False
-    shifted = np.roll(place, 2, axis=1)
-    options = EvaluateOptions()
-    assert not regions.find_dynamic_pixels(shifted, [(place, valid)], options)[:, 4:].any()
-    moved = place.copy()
-    moved[20:40, 30:50] = 255 - moved[20:40, 30:50] // 4
-    moved[:, 80:] = 255
-    found = regions.find_dynamic_pixels(moved, [(place, valid)], options)
-    truth = np.zeros_like(found)
-    truth[20:40, 30:50] = True
-    assert (found & truth).sum() / (found | truth).sum() > 0.8
-    assert not found[:, 81:].any()
-
-
-def test_either_still_picture_explains_a_pixel():
-    place, torn = texture(2), texture(2)
-    torn[40:60, 60:90] = 0
-    valid = np.ones((64, 96), bool)
-    moved = place.copy()
-    moved[10:30, 10:40] = 255
-    options = EvaluateOptions()
-    assert regions.find_dynamic_pixels(moved, [(torn, valid)], options)[40:60, 60:90].mean() > 0.5
-    found = regions.find_dynamic_pixels(moved, [(torn, valid), (place, valid)], options)
-    assert not found[40:60, 60:90].any() and found[12:28, 12:38].all()
-    unknown = [(place, np.zeros_like(valid))]
-    assert not regions.find_dynamic_pixels(moved, unknown, options).any()
-
-
-def test_still_picture_leaves_out_movers_and_follows_the_rotation():
-    K = np.array([[90.0, 0, 47.5], [0, 90, 31.5], [0, 0, 1]])
-    wide = Camera(np.array([[90.0, 0, 79.5], [0, 90, 55.5], [0, 0, 1]]), np.eye(3), np.zeros(3), (160, 112))
-    place = texture(4, (160, 112))
-    frames, cameras = [], []
-    for i, angle in enumerate(np.radians([-4, -2, 0, 2, 4])):
-        R = cv2.Rodrigues(np.array([angle / 2, angle, 0]))[0]
-        camera = Camera(K, R, -R @ np.array([0.01 * i, 0, 0]), SIZE)
-        image, valid = undistort(place, dataclasses.replace(wide, t=-camera.center), camera)
-        assert valid.all()
-        image[20:36, 10 + 16 * i : 26 + 16 * i] = 255
-        frames.append((image, camera))
-        cameras.append(camera)
-    rgb, valid = regions.StillPicture(frames).seen_from(cameras[0])
-    truth, _ = undistort(place, dataclasses.replace(wide, t=-cameras[0].center), cameras[0])
-    inner = np.zeros_like(valid)
-    inner[4:-4, 4:-4] = True
-    assert valid.mean() > 0.8
-    assert metrics.psnr(rgb, truth, valid & inner) > 35
-
-
-def test_neighbour_feature_prefers_the_same_structure():
-    query = texture(2)
-    brighter = np.clip(query.astype(int) + 40, 0, 255).astype(np.uint8)
-    evidence = Evidence({}, {}, query, {"cam00": texture(1), "cam02": brighter, "cam03": texture(3)}, query)
-    assert nn_same_time.render(evidence) is brighter
-    assert np.linalg.norm(nn_same_time.describe_image(query)) == pytest.approx(1)
-    assert not nn_same_time.describe_image(np.full((64, 96, 3), 9, np.uint8)).any()
-
-
-def test_blanks_are_black_for_inst_and_mean_coloured_for_paste():
-    colour = np.full((4, 4, 3), 100, np.uint8)
-    near, far = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
-    near[0], far[1] = True, True
-    evidence = Evidence(
-        {"consensus_rgb": colour, "consensus_valid": near},
-        {"farthest_rgb": colour + 50, "farthest_valid": far},
-        colour,
-        {},
-        colour,
-    )
-    assert [METHODS["inst"](evidence)[row, 0, 0] for row in range(4)] == [100, 0, 0, 0]
-    assert [METHODS["background"](evidence)[row, 0, 0] for row in range(4)] == [0, 150, 0, 0]
-    assert [METHODS["paste"](evidence)[row, 0, 0] for row in range(4)] == [100, 150, 125, 125]
 
 
 def test_input_camera_is_no_evidence(scene, tmp_path, capsys):
@@ -342,9 +345,8 @@ def test_results_of_another_size_are_refused(scene, tmp_path):
 
 def test_a_held_out_camera_makes_no_render():
     stages = Path(cli.__file__).parent
-    makers = [
-        p for p in stages.rglob("*.py") if p.relative_to(stages).parts[0] not in ("evaluate", "baselines")
-    ]
+    readers = ("evaluate", "baselines", "report")
+    makers = [p for p in stages.rglob("*.py") if p.relative_to(stages).parts[0] not in readers]
     importing = [
         p.name for p in makers if "fourd.evaluate" in p.read_text() or "fourd.baselines" in p.read_text()
     ]

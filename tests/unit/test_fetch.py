@@ -1,3 +1,5 @@
+import io
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -108,3 +110,18 @@ def test_convention_qualisys_camera_is_turned_to_opencv_axes_and_metres():
 def test_foreign_calibration_is_refused(text):
     with pytest.raises(InputError, match=r"Calib\.qca\.txt"):
         fetch.cameras_from_qualisys(text, {"cam01": (1088, 1920)}, "Calib.qca.txt")
+
+
+def test_a_tar_file_is_unpacked_as_a_zip_file_is(tmp_path):
+    with tarfile.open(tmp_path / "p.tar.gz", "w:gz") as archive:
+        entry = tarfile.TarInfo("p/a")
+        entry.size = 5
+        archive.addfile(entry, io.BytesIO(b"first"))
+        link = tarfile.TarInfo("p/link")
+        link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+        archive.addfile(link)
+    fetch.unpack(tmp_path / "p.tar.gz", {"p/a": "sub/a"}, tmp_path / "out")
+    assert (tmp_path / "out" / "sub" / "a").read_bytes() == b"first"
+    for name, message in (("p/b", "expected p/b in .* found nothing"), ("p/link", "got a link: refused")):
+        with pytest.raises(InputError, match=message):
+            fetch.unpack(tmp_path / "p.tar.gz", {name: "b"}, tmp_path / "out")

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -115,3 +116,83 @@ def test_bad_images_are_refused():
         metrics.ssim(image[:8], truth[:8])
     with pytest.raises(ValueError, match="bool region"):
         metrics.mse(image, truth, np.ones((20, 20)))
+
+
+def smooth_pair(shape: tuple[int, ...], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Structure at several scales, so that no scale's similarity is zero."""
+    rng = np.random.default_rng(seed)
+    truth = cv2.GaussianBlur(rng.integers(0, 256, shape).astype(np.uint8), (0, 0), 3.0)
+    return np.clip(truth + rng.normal(0, 12, shape), 0, 255).astype(np.uint8), truth
+
+
+def as_tensor(image: np.ndarray):
+    import torch
+
+    return torch.from_numpy(np.atleast_3d(image).transpose(2, 0, 1)[None].astype(np.float64))
+
+
+@pytest.mark.parametrize("shape", [(180, 211, 3), (200, 177)])
+def test_ms_ssim_agrees_with_torchmetrics(shape):
+    ssim_module = pytest.importorskip("torchmetrics.functional.image.ssim", reason="needs torchmetrics")
+    from torch.nn.functional import avg_pool2d
+
+    image, truth = smooth_pair(shape, 8)
+    x, y, product = as_tensor(image), as_tensor(truth), 1.0
+    for i, weight in enumerate(metrics.MS_SSIM_WEIGHTS):
+        options = {"sigma": 1.5, "kernel_size": 11, "data_range": 255.0}
+        full = ssim_module.structural_similarity_index_measure(x, y, return_full_image=True, **options)[1]
+        # It counts windows that leave the picture in its SSIM, but not in its contrast term.
+        similarity = full[..., 5:-5, 5:-5].mean()
+        contrast = ssim_module.structural_similarity_index_measure(
+            x, y, return_contrast_sensitivity=True, **options
+        )[1].mean()
+        if i == 0:
+            assert metrics.ssim(image, truth) == pytest.approx(float(similarity), rel=1e-9)
+        product *= float(similarity if i == 4 else contrast) ** weight
+        x, y = avg_pool2d(x, 2), avg_pool2d(y, 2)
+    assert metrics.ms_ssim(image, truth) == pytest.approx(product, rel=1e-9)
+    whole = ssim_module.multiscale_structural_similarity_index_measure(
+        as_tensor(image), as_tensor(truth), data_range=255.0
+    )
+    assert metrics.ms_ssim(image, truth) == pytest.approx(float(whole), abs=5e-3)
+
+
+def test_ms_ssim_is_one_for_equal_pictures_and_falls_with_noise():
+    rng = np.random.default_rng(2)
+    truth = smooth_pair((190, 180, 3), 1)[1]
+    values = [metrics.ms_ssim(truth, truth)]
+    for sigma in (5, 20, 60):
+        noisy = np.clip(truth + rng.normal(0, sigma, truth.shape), 0, 255).astype(np.uint8)
+        values.append(metrics.ms_ssim(noisy, truth))
+    assert values[0] == pytest.approx(1, abs=1e-12)
+    assert values == sorted(values, reverse=True) and values[-1] < 0.9
+    # Opposite structure: the finest scale's contrast term is negative, and counts as 0.
+    assert metrics.ms_ssim(255 - truth, truth) == 0
+
+
+def test_ms_ssim_of_a_small_picture_is_not_defined():
+    image, truth = smooth_pair((175, 400, 3), 3)
+    assert np.isnan(metrics.ms_ssim(image, truth))
+    image, truth = smooth_pair((176, 176, 3), 3)
+    assert 0 < metrics.ms_ssim(image, truth) < 1
+
+
+def test_both_conventions_of_dssim():
+    image, truth = smooth_pair((40, 40, 3), 4)
+    similarity = metrics.ssim(image, truth)
+    assert metrics.dssim_full(similarity) == pytest.approx(1 - similarity)
+    assert metrics.dssim_full(similarity) == pytest.approx(2 * metrics.dssim_half(similarity))
+    assert (metrics.dssim_half(1.0), metrics.dssim_half(-1.0)) == (0, 1)
+
+
+def test_flicker_is_the_change_that_the_truth_does_not_have():
+    rng = np.random.default_rng(6)
+    earlier, truth = rng.integers(0, 200, (2, 9, 11, 3)).astype(np.uint8)
+    # An error that stays is none.
+    assert (metrics.flicker_map(truth + 7, truth, earlier + 7, earlier) == 0).all()
+    assert (metrics.flicker_map(truth + 7, truth, earlier + 2, earlier) == 5).all()
+    # A render that stands still lacks the truth's change.
+    expected = np.abs(truth.astype(float) - earlier).mean(axis=2)
+    found = metrics.flicker_map(truth, truth, truth, earlier)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert metrics.flicker_map(truth[..., 0], truth[..., 0], truth[..., 0], earlier[..., 0]).shape == (9, 11)

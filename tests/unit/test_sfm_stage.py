@@ -69,7 +69,7 @@ def test_options_and_schema_agree():
 
 
 def project_from_exact_centre(scene, name, frame, source):
-    """Pixels of POINTS in a camera of the scene, moved by the half step or less to its centre in the source."""
+    """Pixels of POINTS in a camera of the scene, put back by the half step or less that its centre moved."""
     camera = scene.tracks[name].at(frame)
     center = (source.center - scene.origin) / scene.scale
     np.testing.assert_allclose(camera.center, center, atol=0.5001 * CENTER_STEP)

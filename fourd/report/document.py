@@ -1,0 +1,77 @@
+"""All figures of the page as one JSON object, checked against its schema before it is written."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+
+from fourd.io import SCHEMA_VERSION
+from fourd.report import costs, environment, extras, progress, scene
+from fourd.report.scores import Scores, add_summary, read_notes, read_scores, summarize
+from fourd.sfm import read_cameras
+
+SCHEMA = Path(__file__).with_name("report.schema.json")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sources:
+    """Where the figures come from. results, benchmarks: folders of one scene; the others may be missing.
+
+    settings: the configuration of the run with all defaults filled in
+    """
+
+    results: Path
+    benchmarks: Path
+    stability: Path | None = None
+    benches: Path | None = None
+    settings: Mapping[str, Any] | None = None
+
+
+def collect_document(sources: Sources) -> tuple[dict[str, Any], Scores | None]:
+    """Everything that can be said in figures and words, and the scores that its means are of.
+
+    Raises InputError for a missing sfm/cameras.json or a file that is not of this workflow.
+    """
+    results = sources.results
+    # Checks every camera, so that a damaged file is named before anything is drawn from it.
+    read_cameras(results / "sfm" / "cameras.json")
+    metrics = results / "evaluate" / "metrics.csv"
+    scores = read_scores(metrics) if metrics.is_file() else None
+    rows = summarize(scores, ("region", "region_source", "method", "metric")) if scores else []
+    add_summary(rows, results / "evaluate" / "summary.csv")
+    jobs = costs.read_jobs(sources.benchmarks)
+    pairs = scene.collect_pairs(results)
+    document = {
+        "schema_version": SCHEMA_VERSION,
+        **scene.collect_scene(results),
+        "map": scene.collect_map(results),
+        "pairs": pairs,
+        "scores": {
+            "rows": rows,
+            "by_view": summarize(scores, ("view", "region", "method", "metric")) if scores else [],
+            "notes": read_notes(results / "evaluate" / "table.md"),
+        },
+        "renders": scene.collect_renders(results),
+        "training": progress.collect_training(results),
+        "costs": costs.collect_costs(results, jobs),
+        "stability": extras.collect_stability(sources.stability),
+        "benches": extras.collect_benches(sources.benches),
+        "ablations": extras.collect_ablations(results / "ablations"),
+        "left_out": scene.collect_left_out(results, pairs, rows),
+        "environment": environment.collect_environment(sources.settings),
+    }
+    heldout = [camera["name"] for camera in document["cameras"] if camera["role"] == "held out"]
+    document["error_time"] = progress.collect_error_time(jobs, rows, heldout)
+    document["warnings"] = scene.collect_warnings(document)
+    return document, scores
+
+
+def check_document(document: Mapping[str, Any]) -> None:
+    """Raise ValueError, naming the key, if a document is not as its schema says."""
+    validator = jsonschema.Draft202012Validator(json.loads(SCHEMA.read_text(encoding="utf-8")))
+    for error in validator.iter_errors(document):
+        where = "/".join(map(str, error.absolute_path))
+        raise ValueError(f"report.json is not as its schema says at {where or 'the top'}: {error.message}")

@@ -1,0 +1,132 @@
+"""The page: chapters in the order in which a reader asks, one file without any request."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fourd.io import read_image
+from fourd.render import list_frames
+from fourd.report.html import Markup, figure, join, tag
+from fourd.report.numbers import plural, show, show_bytes, show_seconds
+from fourd.report.page_costs import cost_chapter, origin_chapter, proof_chapter
+from fourd.report.page_pictures import picture_chapter
+from fourd.report.page_scene import filmed, left_out_chapter, pair_chapter
+from fourd.report.page_scores import progress_chapter, score_chapter
+from fourd.report.pictures import FrameShow, data_uri
+from fourd.report.scores import OURS, Scores, headline_metric, metric_label
+
+FOLDER = Path(__file__).parent
+# Nothing may be loaded but what stands in the page and films beside it.
+POLICY = (
+    "default-src 'none'; img-src data:; media-src 'self' file:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline'"
+)
+CHAPTERS = {
+    "filmed": "Footage",
+    "pairs": "Pairs",
+    "pictures": "Pictures",
+    "scores": "Scores",
+    "progress": "Error against time",
+    "costs": "Cost",
+    "proof": "Extreme cases",
+    "left-out": "Left out",
+    "origin": "How it was made",
+}
+EVIDENCE = {
+    "audio.png": "Clocks from sound: how well the sounds of two films fit, by the delay between them.",
+    "offsets.png": "Clocks from sight: votes of moving points for each film's offset.",
+}
+EVIDENCE_PX = 1400
+
+
+def draw_page(
+    document: Mapping[str, Any],
+    scores: Scores | None,
+    shows: Sequence[FrameShow],
+    evidence: Sequence[tuple[str, np.ndarray]],
+    films: Sequence[Markup],
+    picture_px: int,
+) -> str:
+    """The whole HTML file. evidence: (sentence, picture) of the clocks;  films: players."""
+    scene = document["scene"]
+    cameras = document["cameras"]
+    title = f"{scene['name']}: report"
+    body = [
+        tag(
+            "header",
+            tag("h1", scene["name"].replace("_", " ")),
+            tag(
+                "p",
+                f"{plural(len(cameras), 'camera')}, {plural(scene['num_frames'], 'frame')} at "
+                f"{scene['fps']:.5g} per second, {scene['duration_s']:.3g} s.",
+                class_="lead",
+            ),
+            _facts(document),
+            tag("nav", tag("ul", [tag("li", tag("a", t, href=f"#{a}")) for a, t in CHAPTERS.items()])),
+        ),
+        tag(
+            "main",
+            filmed(document, [(text, data_uri(image, EVIDENCE_PX)) for text, image in evidence]),
+            pair_chapter(document["pairs"]),
+            picture_chapter(shows, picture_px, films),
+            score_chapter(document, scores),
+            progress_chapter(document),
+            cost_chapter(document),
+            proof_chapter(document),
+            left_out_chapter(document),
+            origin_chapter(document),
+        ),
+    ]
+    head = join(
+        tag("meta", charset="utf-8"),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("meta", http_equiv="Content-Security-Policy", content=POLICY),
+        tag("title", title),
+        tag("style", Markup((FOLDER / "page.css").read_text(encoding="utf-8"))),
+    )
+    script = tag("script", Markup((FOLDER / "page.js").read_text(encoding="utf-8")))
+    return "<!doctype html>\n" + tag("html", tag("head", head), tag("body", body, script), lang="en") + "\n"
+
+
+def _facts(document: Mapping[str, Any]) -> Markup:
+    """The few numbers that a reader looks for first."""
+    rows = document["scores"]["rows"]
+    metric = headline_metric(list(dict.fromkeys(row["metric"] for row in rows)))
+    facts = [
+        (f"{metric_label(metric)}, {row['region'].replace('_', ' ')}", show(row["mean"], 4))
+        for row in rows
+        if metric is not None and row["method"] == OURS and row["metric"] == metric
+    ][:2]
+    used = sum(camera["role"] == "input" for camera in document["cameras"])
+    held = sum(camera["role"] == "held out" for camera in document["cameras"])
+    good = sum(pair["status"] == "ok" for pair in document["pairs"])
+    total = document["costs"]["total"]
+    facts += [
+        ("cameras used, held out", f"{used}, {held}"),
+        ("pairs matched", f"{good} of {len(document['pairs'])}"),
+        ("run time", show_seconds(total["run_time_s"])),
+        ("on disk", show_bytes(total["num_bytes"])),
+    ]
+    return tag("dl", [tag("div", tag("dt", name), tag("dd", value)) for name, value in facts], class_="facts")
+
+
+def read_evidence(results: Path) -> list[tuple[str, np.ndarray]]:
+    """Pictures that the clocks were read from, with what they show."""
+    paths = {results / "align" / name: text for name, text in EVIDENCE.items()}
+    return [(text, read_image(path)) for path, text in paths.items() if path.is_file()]
+
+
+def film_players(results: Path, output: Path, picture_px: int) -> list[Markup]:
+    """Players of the scene's films, which stay beside the page; each shows one frame until it is started."""
+    players = []
+    for path in sorted((results / "render").glob("*.mp4")):
+        folders = sorted(p for p in (results / "render" / path.stem).glob("*") if p.is_dir())
+        images = list(list_frames(folders).values())
+        poster = data_uri(read_image(images[len(images) // 2]), picture_px) if images else None
+        source = Path(os.path.relpath(path, output)).as_posix()
+        video = tag("video", src=source, poster=poster, controls=True, preload="none")
+        players.append(figure(video, [tag("b", path.stem.replace("_", " ")), " ", f"film {path.name}"]))
+    return players
