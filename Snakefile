@@ -22,6 +22,7 @@ include: "rules/render.smk"
 include: "rules/evaluate.smk"
 include: "rules/report.smk"
 include: "rules/bench.smk"
+include: "rules/ablations.smk"
 
 
 rule render_all:

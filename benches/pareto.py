@@ -56,3 +56,38 @@ def plot_front(
     axes.legend()
     canvas.draw()
     io.write_png(path, np.asarray(canvas.buffer_rgba())[..., :3])
+
+
+def plot_curves(
+    path: Path | str,
+    rows: Sequence[Mapping[str, Any]],
+    name: str,
+    default: str,
+    error: str = "error",
+    seconds: str = "cpu_seconds",
+) -> None:
+    """PNG of settings that get better with time, a curve each, the default's bold.
+
+    Arguments as `plot_front`; a setting has a row per time.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    curves = {
+        setting: sorted((float(r[seconds]), float(r[error])) for r in rows if str(r[name]) == setting)
+        for setting in dict.fromkeys(str(row[name]) for row in rows)
+    }
+    figure = Figure(figsize=(10, 5), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    # In the order in which the curves end, from the worst, as they lie above each other.
+    for setting, points in sorted(curves.items(), key=lambda item: -item[1][-1][1]):
+        label, width = f"{points[-1][1]:.4g}  {setting}", 3 if setting == default else 1
+        axes.plot(*zip(*points, strict=True), marker="o", linewidth=width, label=label)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel(f"{seconds} (log)")
+    axes.set_ylabel(f"{error} (log)")
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize=8, title="at the end")
+    canvas.draw()
+    io.write_png(path, np.asarray(canvas.buffer_rgba())[..., :3])

@@ -6,7 +6,7 @@ it to a scene, `infer` its use: one frame through the levels, coarse to fine.
 
 import dataclasses
 
-STAGE_VERSION = 2
+STAGE_VERSION = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,10 +19,12 @@ class CompositionOptions:
     head: str = "blend"
     streams: str = "all"
     l1_weight: float = 100.0
-    adversarial_weight: float = 1.0
+    adversarial_weight: float = 0.0
     frequency_weight: float = 100.0
+    average_weights: bool = True
     epochs: int = 10
-    learning_rate: float = 2e-4
+    learning_rate: float = 1e-3
+    warmup_steps: int = 100
     max_scale: float = 1.5
     crop: int | None = None
     validation_samples: int = 4

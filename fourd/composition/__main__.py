@@ -136,7 +136,7 @@ def run(
             "network": trainer.network_arguments,
             "options": dataclasses.asdict(options),
             "step": trainer.counters["step"],
-            "state_dict": trainer.generator.state_dict(),
+            "state_dict": trainer.network.state_dict(),
         },
     )
 
@@ -184,9 +184,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parse(argv)
     cli.set_num_threads(args.threads)
     device = cli.choose_torch_device(args.device)
+    if device == "cuda":
+        # Levels are jobs of their own: where there are several devices, they train at the same time.
+        device = f"cuda:{args.level % torch.cuda.device_count()}"
     # cuBLAS is deterministic only with a fixed workspace, which is read when it starts.
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-    torch.use_deterministic_algorithms(True, warn_only=device == "cuda")
+    torch.use_deterministic_algorithms(True, warn_only=device != "cpu")
     sources = Sources(
         tuple(args.views), tuple(args.foreground), tuple(args.background), dict(args.films), args.cameras
     )

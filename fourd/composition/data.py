@@ -103,7 +103,8 @@ def sample_order(num_samples: int, epoch: int, seed: int) -> list[int]:
 def augment(images: np.ndarray, crop: int | None, max_scale: float, seed: int, step: int) -> np.ndarray:
     """A random crop of the randomly enlarged sample, the same for all its images.
 
-    images: (N, H, W, 4) uint8;  crop: side of the crop, px, at most the picture; None = its size
+    images: (N, H, W, 4) uint8, 0 where invalid
+    crop: side of the crop, px, at most the picture; None = its size
     max_scale: factor of enlargement is uniform in [1, max_scale]
     Returns (N, h, w, 4) float32, 0-255, alpha 0 or 255. A function of its arguments alone, so that
     training resumed at a step draws what it would have drawn.
@@ -116,20 +117,21 @@ def augment(images: np.ndarray, crop: int | None, max_scale: float, seed: int, s
     if max_scale == 1.0:
         y, x = round(top), round(left)
         return images[:, y : y + out_h, x : x + out_w].astype(np.float32)
+    # Only what is seen is resampled, with a pixel around it for the interpolation.
+    y0, x0 = max(0, int(top) - 1), max(0, int(left) - 1)
+    seen = images[:, y0 : int(top + out_h / scale) + 3, x0 : int(left + out_w / scale) + 3]
     shift = 0.5 / scale - 0.5
-    source_from_out = np.array([[1 / scale, 0, left + shift], [0, 1 / scale, top + shift]])
-    return np.stack([_resample(image, source_from_out, (out_w, out_h)) for image in images])
+    source_from_out = np.array([[1 / scale, 0, left - x0 + shift], [0, 1 / scale, top - y0 + shift]])
+    return np.stack([_resample(image, source_from_out, (out_w, out_h)) for image in seen])
 
 
 def _resample(image: np.ndarray, source_from_out: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Bilinear (h, w, 4) float32; colours are averaged over valid pixels only."""
-    alpha = image[..., 3:].astype(np.float32) / 255
-    premultiplied = np.concatenate([image[..., :3] * alpha, alpha], axis=2)
+    """Bilinear (h, w, 4) float32; colours, 0 where invalid, are averaged over valid pixels only."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     warped = cv2.warpAffine(
-        premultiplied, source_from_out, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
+        image.astype(np.float32), source_from_out, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
-    share = warped[..., 3:]
+    share = warped[..., 3:] / 255
     valid = share >= MIN_VALID_SHARE
     colour = np.where(valid, warped[..., :3] / np.maximum(share, MIN_VALID_SHARE), 0)
     return np.concatenate([colour, 255 * valid.astype(np.float32)], axis=2)

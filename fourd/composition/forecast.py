@@ -47,7 +47,7 @@ def forecast_bytes(arguments: Mapping[str, Any], size: tuple[int, int], precisio
 def free_bytes(device: str) -> int | None:
     """Memory that the device has left; None where nobody tells."""
     if torch.device(device).type == "cuda":
-        return torch.cuda.mem_get_info()[0]
+        return torch.cuda.mem_get_info(device)[0]
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             fields = dict(line.split(":", 1) for line in file)

@@ -1,5 +1,6 @@
 """Fits one level's network to a scene: every input camera's own frames are its targets."""
 
+import copy
 import functools
 import logging
 import time
@@ -19,6 +20,8 @@ from fourd.errors import InputError
 log = logging.getLogger("fourd.composition")
 
 MAX_SKIPPED_IN_A_ROW = 3
+# The average of the weights reaches back over about a ninth of the steps so far, whatever their number.
+AVERAGE_POWER = 8
 LOSSES = ("reconstruction", "frequency", "adversarial", "discriminator", "train_psnr_db")
 COLUMNS = ("epoch", "step", "seconds", *LOSSES, "validation_psnr_db", "paste_psnr_db", "skipped_steps")
 
@@ -45,16 +48,39 @@ class Trainer:
             generator, discriminator = CompositionNet(**self.network_arguments), Discriminator()
         nhwc: Any = {"device": device, "memory_format": torch.channels_last}
         self.generator, self.discriminator = generator.to(**nhwc), discriminator.to(**nhwc)
+        # The average starts at the first step, so what the copy holds until then does not count.
+        self.average = (
+            copy.deepcopy(self.generator).requires_grad_(False) if options.average_weights else None
+        )
         rate = options.learning_rate
-        self.generator_optimizer = torch.optim.Adam(self.generator.parameters(), lr=rate)
-        self.discriminator_optimizer = torch.optim.Adam(self.discriminator.parameters(), lr=rate)
+        self.generator_optimizer = torch.optim.Adam(self.generator.parameters(), lr=rate, fused=True)
+        self.discriminator_optimizer = torch.optim.Adam(self.discriminator.parameters(), lr=rate, fused=True)
         self.counters: dict[str, Any] = {
             "step": 0, "skipped": 0, "skipped_in_a_row": 0, "elapsed_s": 0.0, "rows": [], "sums": {}
         }  # fmt: skip
 
+    @property
+    def network(self) -> CompositionNet:
+        """The one to use: the average of the weights so far, or the weights as they are."""
+        return self.average or self.generator
+
+    def set_learning_rate(self, rate: float) -> None:
+        for optimizer in (self.generator_optimizer, self.discriminator_optimizer):
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+
+    def update_average(self, step: int) -> None:
+        """Take the weights after a step, counted from 1, into their average."""
+        if self.average is None:
+            return
+        share = min((AVERAGE_POWER + 1) / (AVERAGE_POWER + step), 1.0)
+        with torch.no_grad():
+            for mean, now in zip(self.average.parameters(), self.generator.parameters(), strict=True):
+                mean.lerp_(now, share)
+
     def _parts(self) -> dict[str, Any]:
-        names = ("generator", "discriminator", "generator_optimizer", "discriminator_optimizer")
-        return {name: getattr(self, name) for name in names}
+        names = ("generator", "discriminator", "generator_optimizer", "discriminator_optimizer", "average")
+        return {name: part for name in names if (part := getattr(self, name)) is not None}
 
     def state(self) -> dict[str, Any]:
         return {name: part.state_dict() for name, part in self._parts().items()} | {"counters": self.counters}
@@ -107,7 +133,8 @@ def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> bool:
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     gradients = [p.grad for group in optimizer.param_groups for p in group["params"]]
-    if not all(bool(torch.isfinite(x).all()) for x in (loss, *gradients)):
+    # One number to look at: it is not finite as soon as one gradient is not.
+    if not bool(torch.isfinite(loss) & torch.isfinite(torch.nn.utils.get_total_norm(gradients))):
         return False
     optimizer.step()
     return True
@@ -127,7 +154,7 @@ def train(
     Returns the rows of the log. Raises SystemExit after a signal, with everything saved.
     """
     training, apart = split
-    counters, device = trainer.counters, next(trainer.generator.parameters()).device
+    counters = trainer.counters
     total = options.epochs * len(training)
     progress = Progress(total, counters["step"])
     started = time.monotonic() - counters["elapsed_s"]
@@ -135,26 +162,11 @@ def train(
         # What the untrained network gives: without it nobody could tell what training added.
         counters["rows"].append(_log_row(trainer, samples, apart, 0, options.precision))
     while counters["step"] < total and not _is_over(options.max_minutes, started):
-        step = counters["step"]
-        epoch, position = divmod(step, len(training))
-        sample = training[data.sample_order(len(training), epoch, options.seed)[position]]
-        images = data.augment(samples.images(sample), options.crop, options.max_scale, options.seed, step)
-        streams = data.streams_from_images(images, data.TRAINING_STREAMS).to(device)
-        target, valid = (tensor.to(device) for tensor in data.target_from_images(images))
-
-        result = update(trainer, streams, target, valid, options)
-        counters["step"] = step + 1
+        terms = train_step(trainer, samples, training, options)
         counters["elapsed_s"] = time.monotonic() - started
-        if result is None:
-            _count_skipped(counters, sample)
-        else:
-            counters["skipped_in_a_row"] = 0
-            terms = result[0] | {"train_psnr_db": _psnr(result[1], target, valid)}
-            for name, value in terms.items():
-                total_value, count = counters["sums"].get(name, (0.0, 0))
-                counters["sums"][name] = (total_value + value, count + 1)
-            progress.report(step + 1, epoch, options.epochs, terms)
-
+        step, epoch = counters["step"], (counters["step"] - 1) // len(training)
+        if terms is not None:
+            progress.report(step, epoch, options.epochs, terms)
         if counters["step"] % len(training) == 0:
             counters["rows"].append(_log_row(trainer, samples, apart, epoch + 1, options.precision))
             counters["sums"] = {}
@@ -162,7 +174,7 @@ def train(
         elif stop.signal_number is not None or save.is_due(options.checkpoint_s):
             save(trainer)
         if stop.signal_number is not None:
-            log.info("stopped by a signal at step %d of %d: run again to continue", step + 1, total)
+            log.info("stopped by a signal at step %d of %d: run again to continue", step, total)
             raise SystemExit(128 + stop.signal_number)
     save(trainer)
     unfinished = counters["step"] % len(training) != 0
@@ -170,6 +182,40 @@ def train(
         return counters["rows"]
     epoch = counters["step"] // len(training) + 1
     return [*counters["rows"], _log_row(trainer, samples, apart, epoch, options.precision)]
+
+
+def train_step(
+    trainer: Trainer,
+    samples: data.SampleSet,
+    training: Sequence[data.SampleId],
+    options: CompositionOptions,
+    order: Sequence[int] = data.TRAINING_STREAMS,
+) -> dict[str, float] | None:
+    """The next step, on the sample whose turn it is, counted in `trainer.counters`.
+
+    training: the samples to train on;  order: which estimate feeds each stream
+    Returns the losses, unweighted; None if the step was skipped. Raises InputError after too many of these.
+    """
+    counters, device = trainer.counters, next(trainer.generator.parameters()).device
+    step = counters["step"]
+    epoch, position = divmod(step, len(training))
+    trainer.set_learning_rate(options.learning_rate * min(1.0, (step + 1) / max(options.warmup_steps, 1)))
+    sample = training[data.sample_order(len(training), epoch, options.seed)[position]]
+    images = data.augment(samples.images(sample), options.crop, options.max_scale, options.seed, step)
+    streams = data.streams_from_images(images, order).to(device)
+    target, valid = (tensor.to(device) for tensor in data.target_from_images(images))
+    result = update(trainer, streams, target, valid, options)
+    counters["step"] = step + 1
+    if result is None:
+        _count_skipped(counters, sample)
+        return None
+    trainer.update_average(step + 1)
+    counters["skipped_in_a_row"] = 0
+    terms = result[0] | {"train_psnr_db": _psnr(result[1], target, valid)}
+    for name, value in terms.items():
+        total, count = counters["sums"].get(name, (0.0, 0))
+        counters["sums"][name] = (total + value, count + 1)
+    return terms
 
 
 def _is_over(max_minutes: float | None, started: float) -> bool:
@@ -203,7 +249,7 @@ def _log_row(
     counters = trainer.counters
     row = {name: total / count for name, (total, count) in counters["sums"].items()}
     row |= {"epoch": epoch, "step": counters["step"], "seconds": round(counters["elapsed_s"], 1)}
-    row |= {"skipped_steps": counters["skipped"]} | validate(trainer.generator, samples, apart, precision)
+    row |= {"skipped_steps": counters["skipped"]} | validate(trainer.network, samples, apart, precision)
     return {name: row.get(name, "") for name in COLUMNS}
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benches.pareto import on_front, plot_front
+from benches.pareto import on_front, plot_curves, plot_front
 from fourd import io
 
 POINTS = st.lists(st.tuples(st.floats(0, 10), st.floats(0.1, 10)), min_size=1, max_size=12)
@@ -33,3 +33,17 @@ def test_picture_shows_the_front_and_the_default(tmp_path):
     plot_front(tmp_path / "front.png", rows, "setting", "s2")
     picture = io.read_image(tmp_path / "front.png")
     assert picture.shape[0] > 300 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_picture_shows_a_curve_per_setting(tmp_path):
+    rows = [
+        {"setting": name, "error": e / t, "cpu_seconds": t}
+        for name, e in (("a", 1), ("b", 2))
+        for t in (9, 3)
+    ]
+    coloured = []
+    for shown in (rows, rows[:2]):
+        plot_curves(tmp_path / "curves.png", shown, "setting", "a")
+        picture = io.read_image(tmp_path / "curves.png").astype(int)
+        coloured.append((picture.max(axis=2) - picture.min(axis=2) > 60).sum())
+    assert coloured[0] > coloured[1] > 100

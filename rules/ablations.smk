@@ -1,0 +1,48 @@
+"""What each part of the composition is worth on the scene at hand: `snakemake ablations`."""
+
+ABLATIONS = [
+    "default",
+    "paper",
+    "l1",
+    "l1_adversarial",
+    "l1_adversarial_frequency",
+    "one_stream",
+    "streams_paper",
+    "input_closest",
+    "input_median",
+    "not_enlarged",
+]
+
+
+rule ablations:
+    input:
+        cameras=f"<results>/{SCENE.name}/sfm/cameras.json",
+        films=expand(f"<results>/{SCENE.name}/frames/cameras/{{cam}}.npz", cam=SCENE.cameras),
+        views=expand(f"<results>/{SCENE.name}/views/{{cam}}.json", cam=SCENE.cameras),
+        foreground=training_foregrounds(),
+        background=training_backgrounds(),
+        heldout=[
+            f"<results>/{SCENE.name}/{kind}/{cam}/{chunk}.npz"
+            for kind in ("foreground", "background")
+            for cam in SCENE.heldout
+            for chunk in chunks_of_view(cam)
+        ],
+    output:
+        table=f"<results>/{SCENE.name}/ablations/composition.csv",
+        picture=f"<results>/{SCENE.name}/ablations/composition.png",
+    log:
+        f"<logs>/{SCENE.name}/ablations.log",
+    benchmark:
+        f"<benchmarks>/{SCENE.name}/ablations.tsv"
+    conda:
+        "../envs/torch.yaml"
+    threads: 1
+    params:
+        scene=RESULTS,
+        labels=flags_from_mapping({"labels": SCENE.labels}) if SCENE.labels else "",
+        variants=ABLATIONS,
+        version=fourd_config.stage_version("composition"),
+    shell:
+        "PYTHONPATH={workflow.basedir} python -m benches.composition --scene {params.scene}"
+        " {params.labels} --variants {params.variants} --marks 20 60"
+        " --output $(dirname {output.table}) > {log} 2>&1"
