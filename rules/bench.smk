@@ -36,10 +36,11 @@ rule bench_stereo:
         "../envs/torch.yaml"
     threads: 1
     params:
+        root=workflow.basedir,
         pairs=flags_from_mapping({"data": config["bench_pairs"]}),
         version=fourd_config.stage_version("stereo"),
     shell:
-        "PYTHONPATH={workflow.basedir} python -m benches.stereo {params.pairs}"
+        "PYTHONPATH={params.root} python -m benches.stereo {params.pairs}"
         " --output $(dirname {output}) > {log} 2>&1"
 
 

@@ -24,7 +24,7 @@ rule report_page:
         "../envs/vision.yaml"
     threads: 1
     params:
-        results=RESULTS,
+        results=lambda wildcards, input: Path(input.cameras).parents[1],
         benchmarks=f"{config['pathvars'].get('benchmarks', 'benchmarks')}/{SCENE.name}",
         # Shown if they are there: the page does not wait for suites that take longer than the run.
         stability=f"{Path(RESULTS).parent}/stability/stability.csv",

@@ -2,7 +2,8 @@
 
 A coarser level says where to look: one band around its own answer, one around that of the nearest other
 surface. Compared are colours and the order of grey levels; where the picture changes, disparity may jump
-at a lower price, so that surfaces end where their colour does.
+at a lower price, so that surfaces end where their colour does. Where surfaces meet, the order is that of
+the nearest neighbours alone: a wide window shows both surfaces and follows the nearer one.
 
 Disparity d of pixel x belongs to column x - d of the other image. Other rows are stored mirrored, so that
 a band is a run of neighbouring values, which the compiler turns into vector code: that is why the
@@ -18,13 +19,16 @@ import numpy as np
 
 BAND_PX = 16
 NUM_BANDS = 2
-_CENSUS_BIT = np.int16(4)
-"""Cost of a neighbour whose order differs, in grey levels summed over the channels."""
+_CENSUS_BIT, _NEAREST_BIT = np.int16(4), np.int16(8)
+"""Cost of a neighbour whose order differs, in grey levels summed over the channels, and where only the
+nearest neighbours count."""
+_ALL, _NEAREST = np.uint32(2**25 - 1), np.uint32(0b00000_01110_01110_01110_00000)
+"""Bits of a census over 5x5 px, row by row, and those of its inner 3x3 px."""
 _SMALL = np.int16(64)
 """Penalty of a step of 1 px between neighbours, in the same units."""
-_LARGE, _LARGE_AT_EDGES, _EDGE_LEVELS = 320.0, 96.0, 48.0
-"""Penalty of any larger step between pixels of one colour, its lower bound, and the difference of
-colours, summed over the channels, that halves it."""
+_LARGE_AT_EDGES, _EDGE_LEVELS = 96.0, 48.0
+"""Lower bound of the penalty of any larger step, and the difference of colours, summed over the channels,
+that halves it."""
 _UNIQUENESS_PERCENT = 5
 _MARGIN = BAND_PX + 2
 """Bands this far apart have no step of 1 px in common."""
@@ -39,12 +43,14 @@ def band_costs(
     theirs: np.ndarray,
     our_census: np.ndarray,
     their_census: np.ndarray,
+    is_step: np.ndarray,
     first: np.ndarray,
     reach: int,
 ) -> np.ndarray:
     """How unlike pixel and match are at every disparity of every band.
 
-    ours, theirs: (H, C, W) int16 channels of both images;  *_census: (H, W) uint32
+    ours, theirs: (H, C, W) int16 channels of both images;  *_census: (H, W) uint32 of 5x5 px
+    is_step: (H, W) bool, pixels of which only the nearest neighbours are compared
     first: (H, W, B) int16 lowest disparity of each band, px;  reach: bound of |disparity| in any band, px
     Returns (H, W, B, BAND_PX) int16; borders of the other image repeat
     """
@@ -64,7 +70,7 @@ def band_costs(
                 ours[y, c], low[c], high[c], there[0], there[1], there[2], first[y], reach, costs[y]
             )
         _mirror(their_census[y], reach, order)
-        _compare_order(our_census[y], order, first[y], reach, costs[y])
+        _compare_order(our_census[y], order, is_step[y], first[y], reach, costs[y])
     return costs
 
 
@@ -113,13 +119,19 @@ def _compare_colours(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _compare_order(
-    here: np.ndarray, there: np.ndarray, first: np.ndarray, reach: int, costs: np.ndarray
+    here: np.ndarray,
+    there: np.ndarray,
+    is_step: np.ndarray,
+    first: np.ndarray,
+    reach: int,
+    costs: np.ndarray,
 ) -> None:
     """Census transforms of a row, added to its costs."""
     for x in range(here.size):
+        counted, price = (_NEAREST, _NEAREST_BIT) if is_step[x] else (_ALL, _CENSUS_BIT)
         for band in range(first.shape[1]):
             start = reach + here.size - 1 - x + np.int64(first[x, band])
-            _add_order(here[x], there[start : start + BAND_PX], costs[x, band])
+            _add_order(here[x], there[start : start + BAND_PX], counted, price, costs[x, band])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -140,39 +152,42 @@ def _add_colours(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_order(here: np.uint32, there: np.ndarray, costs: np.ndarray) -> None:
-    """Number of bits that differ, counted in pairs, fours and bytes."""
+def _add_order(
+    here: np.uint32, there: np.ndarray, counted: np.uint32, price: np.int16, costs: np.ndarray
+) -> None:
+    """Price of the bits that differ, which are counted in pairs, fours and bytes."""
     for d in range(BAND_PX):
-        bits = _u32(here ^ there[d])
+        bits = _u32(_u32(here ^ there[d]) & counted)
         bits = _u32(bits - _u32(_u32(bits >> _u32(1)) & _u32(0x55555555)))
         bits = _u32(_u32(bits & _u32(0x33333333)) + _u32(_u32(bits >> _u32(2)) & _u32(0x33333333)))
         bits = _u32(_u32(bits + _u32(bits >> _u32(4))) & _u32(0x0F0F0F0F))
         count = _i16(_u32(_u32(bits * _u32(0x01010101)) >> _u32(24)))
-        costs[d] = _i16(costs[d] + _i16(count * _CENSUS_BIT))
+        costs[d] = _i16(costs[d] + _i16(count * price))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def jump_penalties(image: np.ndarray) -> np.ndarray:
-    """(2, H, W) int16: price of a jump between each pixel and the one left of it, and the one above.
+def jump_penalties(image: np.ndarray, large: float, directions: int) -> np.ndarray:
+    """(directions, H, W) int16: price of a jump between each pixel and its neighbours.
 
-    image: (H, W, C) uint8; the first column and row have no such neighbour and 0
+    image: (H, W, C) uint8;  large: price between pixels of one colour
+    directions: 2, the neighbour on the left and that above, or 4, those above to the left and right too
+    Where there is no such neighbour, 0
     """
     height, width, channels = image.shape
     price = np.empty(channels * 255 + 1, np.int16)
     for difference in range(price.size):
-        price[difference] = _i16(max(_LARGE / (1 + difference / _EDGE_LEVELS), _LARGE_AT_EDGES))
-    penalties = np.zeros((2, height, width), np.int16)
-    for y in range(height):
-        for x in range(width):
-            to_left, to_above = 0, 0
-            for c in range(channels):
-                here = np.int64(image[y, x, c])
-                to_left += abs(here - np.int64(image[y, max(x - 1, 0), c]))
-                to_above += abs(here - np.int64(image[max(y - 1, 0), x, c]))
-            if x > 0:
-                penalties[0, y, x] = price[to_left]
-            if y > 0:
-                penalties[1, y, x] = price[to_above]
+        price[difference] = _i16(max(large / (1 + difference / _EDGE_LEVELS), _LARGE_AT_EDGES))
+    penalties = np.zeros((directions, height, width), np.int16)
+    for direction in range(directions):
+        up = 0 if direction == 0 else 1
+        aside = (-1, 0, -1, 1)[direction]
+        for y in range(up, height):
+            for x in range(max(-aside, 0), width - max(aside, 0)):
+                difference = 0
+                for c in range(channels):
+                    here, there = np.int64(image[y, x, c]), np.int64(image[y - up, x + aside, c])
+                    difference += abs(here - there)
+                penalties[direction, y, x] = price[difference]
     return penalties
 
 

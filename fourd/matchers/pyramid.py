@@ -21,13 +21,18 @@ from fourd.matchers.census import census
 from fourd.matchers.semi_global import aggregate, least_index
 
 _HALF_CENSUS_PX = 2
-_COARSE_SMALL, _COARSE_LARGE = 48, 160
-"""Penalties of a step of 1 px and of more at half size, in grey levels summed over the channels: low ones
-keep thin things, and what is wrong for it costs no more than a band."""
+_LARGE = 320.0
+"""Penalty of a step of more than 1 px between pixels of one colour, in grey levels summed over the
+channels."""
+_COARSE_SMALL, _COARSE_LARGE = 48, 240.0
+"""Penalties of a step of 1 px and of more at half size: low ones keep thin things, and what is wrong for it
+costs no more than a band."""
 _MAX_CELLS = 40_000_000
 """Pixels times disparities of a level that is searched whole, 4 bytes each; a larger one gets bands too."""
 _SURFACE_REACH_PX = 3
 """Window of the half-size disparities in which another surface is looked for, px."""
+_STEP_PX = 8
+"""Surfaces farther apart than this meet in a step."""
 
 
 class PyramidMatcher:
@@ -48,7 +53,9 @@ def _match_in_bands(
     """Summed costs (H, W, 2, BAND_PX) int16 of the bands that half the size suggests, and those bands."""
     coarse = _match_every_pixel(_halve(left), _halve(right), math.floor(lowest / 2), math.ceil(highest / 2))
     first = _choose_bands(2 * coarse, left.shape[:2], lowest, highest)
-    return aggregate_bands(_compare(left, right, first), first, jump_penalties(left)), first
+    is_step = np.abs(first[..., 1] - first[..., 0]) > _STEP_PX
+    costs = _compare(left, right, is_step, first)
+    return aggregate_bands(costs, first, jump_penalties(left, _LARGE, 2)), first
 
 
 def _match_every_pixel(left: np.ndarray, right: np.ndarray, lowest: int, highest: int) -> np.ndarray:
@@ -62,13 +69,14 @@ def _match_every_pixel(left: np.ndarray, right: np.ndarray, lowest: int, highest
     else:
         starts = np.arange(lowest, highest + 1, BAND_PX, dtype=np.int16)
         first = np.ascontiguousarray(np.broadcast_to(starts, (height, width, len(starts))))
-        costs = _compare(left, right, first).reshape(height, width, -1)
-        total = aggregate(costs, _COARSE_SMALL, _COARSE_LARGE)
+        is_step = np.zeros((height, width), bool)
+        costs = _compare(left, right, is_step, first).reshape(height, width, -1)
+        total = aggregate(costs, _COARSE_SMALL, jump_penalties(left, _COARSE_LARGE, 4))
         found = least_index(total).astype(np.float32) + np.float32(lowest)
     return cv2.medianBlur(found, 3)
 
 
-def _compare(left: np.ndarray, right: np.ndarray, first: np.ndarray) -> np.ndarray:
+def _compare(left: np.ndarray, right: np.ndarray, is_step: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Arguments and result as `band_costs`, of images (H, W, 3) uint8."""
     channels = [np.ascontiguousarray(image.transpose(0, 2, 1), np.int16) for image in (left, right)]
     order = [
@@ -76,7 +84,7 @@ def _compare(left: np.ndarray, right: np.ndarray, first: np.ndarray) -> np.ndarr
         for image in (left, right)
     ]
     reach = int(np.abs(first).max(initial=0)) + BAND_PX
-    return band_costs(channels[0], channels[1], order[0], order[1], first, reach)
+    return band_costs(channels[0], channels[1], order[0], order[1], is_step, first, reach)
 
 
 def _choose_bands(coarse: np.ndarray, size: tuple[int, int], lowest: int, highest: int) -> np.ndarray:

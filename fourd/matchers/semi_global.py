@@ -12,16 +12,23 @@ _FAR = np.int16(20000)
 _i16 = np.int16
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def aggregate(cost: np.ndarray, small: int, large: int) -> np.ndarray:
+def aggregate(cost: np.ndarray, small: int, large: int | np.ndarray) -> np.ndarray:
     """Costs summed along eight paths that end in each pixel (semi-global matching).
 
     cost: (H, W, D) uint8, or int16 of at most 4000 less the larger penalty
-    small, large: penalty for a step of one hypothesis, and of more
+    small, large: penalty for a step of one hypothesis, and of more; the latter may be (4, H, W) int16,
+    between each pixel and the one left of it, above, above to the left and above to the right
     Returns (H, W, D) int16
     """
+    height, width = cost.shape[:2]
+    jumps = large if isinstance(large, np.ndarray) else np.full((4, height, width), large, np.int16)
+    return _aggregate(cost, _i16(small), jumps)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _aggregate(cost: np.ndarray, step: np.int16, jumps: np.ndarray) -> np.ndarray:
+    """Arguments and result as `aggregate`."""
     height, width, count = cost.shape
-    step, jump = _i16(small), _i16(large)
     total = np.zeros((height, width, count), np.int16)
     # Paths of two rows, from up-left, up and up-right, with a blank column and hypothesis at both ends.
     paths = np.empty((3, 2, width + 2, count + 2), np.int16)
@@ -34,13 +41,24 @@ def aggregate(cost: np.ndarray, small: int, large: int) -> np.ndarray:
             array[:] = _FAR
         for i in range(height):
             y = i if forward else height - 1 - i
-            _path_along(forward, cost[y], step, jump, line, total[y])
+            _path_along(forward, cost[y], step, jumps[0, y], line, total[y])
             a, b = i % 2, (i + 1) % 2
             for k in range(3):
                 # In the second pass the row before is the one below, and its up-left is down-right.
                 shift = k - 1 if forward else 1 - k
+                # A price stands at the lower one of two pixels.
+                jump = jumps[1 if k == 1 else 2 + k // 2, y if forward else min(y + 1, height - 1)]
                 _path_down(
-                    paths[k, a], least[k, a], shift, cost[y], step, jump, paths[k, b], least[k, b], total[y]
+                    paths[k, a],
+                    least[k, a],
+                    shift,
+                    cost[y],
+                    step,
+                    jump,
+                    0 if forward else shift,
+                    paths[k, b],
+                    least[k, b],
+                    total[y],
                 )
     return total
 
@@ -53,17 +71,21 @@ def _path_down(
     shift: int,
     cost: np.ndarray,
     small: np.int16,
-    large: np.int16,
+    jumps: np.ndarray,
+    jump_shift: int,
     path: np.ndarray,
     least: np.ndarray,
     total: np.ndarray,
 ) -> None:
-    """A row of paths, from the row before and columns off by `shift`, to `path`, and added to `total`."""
+    """A row of paths, from the row before and columns off by `shift`, to `path`, and added to `total`.
+
+    jumps: (W,) penalties of columns off by `jump_shift`
+    """
     width, count = cost.shape
     for x in range(width):
         from_column = x + 1 + shift
         lowest = least_before[from_column]
-        jump = _i16(lowest + large)
+        jump = _i16(lowest + jumps[min(max(x + jump_shift, 0), width - 1)])
         least_here = _i16(32000)
         for d in range(count):
             step = _i16(min(before[from_column, d], before[from_column, d + 2]) + small)
@@ -77,7 +99,7 @@ def _path_down(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _path_along(
-    forward: bool, cost: np.ndarray, small: np.int16, large: np.int16, line: np.ndarray, total: np.ndarray
+    forward: bool, cost: np.ndarray, small: np.int16, jumps: np.ndarray, line: np.ndarray, total: np.ndarray
 ) -> None:
     """A path along a row, added to `total`."""
     width, count = cost.shape
@@ -88,7 +110,7 @@ def _path_along(
     for i in range(width):
         x = i if forward else width - 1 - i
         here, there = i % 2, (i + 1) % 2
-        jump = _i16(lowest + large)
+        jump = _i16(lowest + jumps[x if forward else min(x + 1, width - 1)])
         least = _i16(32000)
         for d in range(count):
             step = _i16(min(line[here, d], line[here, d + 2]) + small)

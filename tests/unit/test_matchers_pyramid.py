@@ -14,6 +14,7 @@ from fourd.matchers.banded import (
 )
 from fourd.matchers.census import census
 from fourd.matchers.pyramid import PyramidMatcher
+from fourd.matchers.semi_global import aggregate
 from fourd.stereo.disparity import match_right
 from tests.unit.test_matchers import overlapping, shifted_pair, texture
 
@@ -88,9 +89,11 @@ def random_bands(height, width, seed=0):
 def test_costs_are_those_of_birchfield_tomasi_and_census():
     rng = np.random.default_rng(1)
     ours, theirs = (rng.integers(0, 256, (3, 3, 30)).astype(np.int16) for _ in range(2))
-    signatures = [rng.integers(0, 2**24, (3, 30)).astype(np.uint32) for _ in range(2)]
+    signatures = [rng.integers(0, 2**25, (3, 30)).astype(np.uint32) for _ in range(2)]
     first = random_bands(3, 30)
-    costs = band_costs(ours, theirs, signatures[0], signatures[1], first, 40)
+    is_step = rng.random((3, 30)) < 0.5
+    costs = band_costs(ours, theirs, signatures[0], signatures[1], is_step, first, 40)
+    nearest = sum(1 << (5 * row + column) for row in (1, 2, 3) for column in (1, 2, 3))
 
     def half(channel, x):
         """Values at x and half a pixel to either side."""
@@ -100,7 +103,8 @@ def test_costs_are_those_of_birchfield_tomasi_and_census():
 
     for y, x, band, d in rng.integers(0, (3, 30, NUM_BANDS, BAND_PX), (200, 4)):
         column = int(np.clip(x - int(first[y, x, band]) - d, 0, 29))
-        expected = 4 * int(signatures[0][y, x] ^ signatures[1][y, column]).bit_count()
+        differs = int(signatures[0][y, x] ^ signatures[1][y, column])
+        expected = 8 * (differs & nearest).bit_count() if is_step[y, x] else 4 * differs.bit_count()
         for c in range(3):
             a, b = half(ours[y, c], x), half(theirs[y, c], column)
             forth = max(0, a[0] - max(b), min(b) - a[0])
@@ -115,7 +119,7 @@ def test_paths_are_those_of_semi_global_matching():
     first = random_bands(height, width)
     costs = rng.integers(0, 300, (height, width, NUM_BANDS, BAND_PX)).astype(np.int16)
     image = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
-    penalties = jump_penalties(image).astype(int)
+    penalties = jump_penalties(image, 320.0, 2).astype(int)
     expected = np.zeros(costs.shape, int)
 
     def disparities(y, x):
@@ -144,15 +148,43 @@ def test_paths_are_those_of_semi_global_matching():
     np.testing.assert_array_equal(aggregate_bands(costs, first, penalties.astype(np.int16)), expected)
 
 
+def test_eight_paths_pay_the_price_between_their_pixels():
+    height, width, count, small = 4, 5, 6, 9
+    rng = np.random.default_rng(3)
+    cost = rng.integers(0, 200, (height, width, count)).astype(np.int16)
+    prices = rng.integers(10, 60, (4, height, width)).astype(np.int16)
+    towards = ((0, -1), (-1, 0), (-1, -1), (-1, 1))
+    expected = np.zeros(cost.shape, int)
+    for direction, (up, aside) in enumerate(towards):
+        for sign in (1, -1):
+            path = {}
+            for y in range(height)[::sign]:
+                for x in range(width)[:: sign if up == 0 else 1]:
+                    value = cost[y, x].astype(int)
+                    before = path.get((y + sign * up, x + sign * aside))
+                    if before is not None:
+                        # The price stands at the pixel that comes later in the picture.
+                        at = (y, x) if sign == 1 else (y - up, x - aside)
+                        jump = before.min() + prices[direction][at]
+                        padded = np.pad(before, 1, constant_values=10_000)
+                        steps = [before, padded[:-2] + small, padded[2:] + small]
+                        value = value + np.minimum(np.min(steps, axis=0), jump) - before.min()
+                    path[y, x] = value
+                    expected[y, x] += value
+    np.testing.assert_array_equal(aggregate(cost, small, prices), expected)
+
+
 def test_a_jump_is_cheaper_where_colours_change():
     image = np.full((3, 4, 3), 90, np.uint8)
     image[:, 2:] = 106
-    across, down = jump_penalties(image)
+    across, down, down_left, down_right = jump_penalties(image, 320.0, 4)
     assert np.all(across[:, 0] == 0) and np.all(down[0] == 0)
     np.testing.assert_array_equal(across[:, 1:], [[320, 160, 320]] * 3)
     assert np.all(down[1:] == 320)
+    np.testing.assert_array_equal(down_left[1:], [[0, 320, 160, 320]] * 2)
+    np.testing.assert_array_equal(down_right[1:], [[320, 160, 320, 0]] * 2)
     image[:, 2:] = 255
-    assert np.all(jump_penalties(image)[0][:, 2] == 96)
+    assert np.all(jump_penalties(image, 320.0, 2)[0][:, 2] == 96)
 
 
 def test_best_of_two_bands_between_whole_disparities():
