@@ -29,6 +29,8 @@ def filmed(results: Path, cam: str) -> np.ndarray:
 def write_jpg(path: Path, picture: np.ndarray) -> None:
     scale = WIDTH / picture.shape[1]
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    # OpenCV writes nothing, and says nothing, where there is no folder.
+    path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 

@@ -39,11 +39,10 @@ rule ablations:
     threads: 1
     params:
         root=workflow.basedir,
-        scene=lambda wildcards, input: Path(input.cameras).parents[1],
         labels=flags_from_mapping({"labels": SCENE.labels}) if SCENE.labels else "",
         variants=ABLATIONS,
         version=fourd_config.stage_version("composition"),
     shell:
-        "PYTHONPATH={params.root} python -m benches.composition --scene {params.scene}"
+        "PYTHONPATH={params.root} python -m benches.composition --scene $(dirname $(dirname {input.cameras}))"
         " {params.labels} --variants {params.variants} --marks 20 60"
         " --output $(dirname {output.table}) > {log} 2>&1"

@@ -24,7 +24,6 @@ rule report_page:
         "../envs/vision.yaml"
     threads: 1
     params:
-        results=lambda wildcards, input: Path(input.cameras).parents[1],
         benchmarks=f"{config['pathvars'].get('benchmarks', 'benchmarks')}/{SCENE.name}",
         # Shown if they are there: the page does not wait for suites that take longer than the run.
         stability=f"{Path(RESULTS).parent}/stability/stability.csv",
@@ -33,7 +32,7 @@ rule report_page:
         options=options("report"),
         version=fourd_config.stage_version("report"),
     shell:
-        "python -m fourd.report --results {params.results} --benchmarks {params.benchmarks}"
+        "python -m fourd.report --results $(dirname $(dirname {input.cameras})) --benchmarks {params.benchmarks}"
         " --stability {params.stability} --benches {params.benches} {params.settings}"
         " {params.options} --output $(dirname {output.page}) 2> {log}"
 

@@ -254,10 +254,13 @@ def network_in_half_precision() -> Outcome:
 
 def _estimates(valid: bool) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Foreground and background of a frame, grey where valid."""
+    from fourd.composition.data import ESTIMATES
+
     rgb = np.full((*SIZE, 3), 90 if valid else 0, np.uint8)
-    known = np.full(SIZE, valid)
-    foreground = {"consensus_rgb": rgb, "consensus_valid": known}
-    return foreground, {"farthest_rgb": rgb, "farthest_valid": known}
+    arrays: dict[str, dict[str, np.ndarray]] = {"foreground": {}, "background": {}}
+    for kind, name in ESTIMATES:
+        arrays[kind] |= {f"{name}_rgb": rgb, f"{name}_valid": np.full(SIZE, valid)}
+    return arrays["foreground"], arrays["background"]
 
 
 def frame_of_nothing_but_holes() -> Outcome:
