@@ -48,9 +48,10 @@ log = logging.getLogger(__name__)
 
 # A model counts as better explained by distortion only if that gains this share of observations.
 DISTORTION_GAIN = 1.05
-# A mapper that starts from an unlucky pair ends in pieces; it starts anew while pictures that match
-# those of another camera are missing.
+# A mapper that starts from an unlucky pair ends in pieces, or bent. It starts anew until two models have
+# all pictures that match those of another camera, and about as many observations as the best has.
 MAX_STARTS = 6
+SAME_MODEL = 0.9
 
 
 def recover_cameras(
@@ -145,7 +146,7 @@ def _map(
     the mapper's own leave observations to chance.
     """
     linked = {key for pair in pairs if pair.left[0] != pair.right[0] for key in (pair.left, pair.right)}
-    found = []
+    found, num_observed = [], []
     for seed in range(1, MAX_STARTS + 1):
         tried = []
         for radial in ((), (0.0,)):
@@ -154,7 +155,8 @@ def _map(
             tried += [[_adjust_corners(models[0], options), *models[1:]]] if models else []
         if not found or _most_observed(tried) > _most_observed(found):
             found = tried
-        if any(linked <= set(models[0].poses) for models in found):
+        num_observed += [len(m[0].obs_px) for m in tried if linked <= set(m[0].poses)]
+        if sum(number > SAME_MODEL * max(num_observed) for number in num_observed) >= 2:
             break
     if len(found) < 2:
         return found[0] if found else []
