@@ -1,4 +1,4 @@
-"""SfM+humans: a body model fitted to the people over the sparse points; its row says why it is empty."""
+"""SfM+humans, a body model fitted to people over the sparse points: not built, and its row says so."""
 
 import numpy as np
 
@@ -6,5 +6,5 @@ from fourd.baselines.evidence import Evidence, Unavailable
 
 
 def render(evidence: Evidence) -> np.ndarray:
-    """Raises Unavailable: the pose and body models are an extra that is not installed."""
-    raise Unavailable("extra not installed: pose and body models")
+    """Raises Unavailable: nothing here finds people or fits bodies yet."""
+    raise Unavailable("not built: needs a pose and a body model")

@@ -118,7 +118,7 @@ def test_methods_without_their_material_say_why():
         METHODS["sfm"](make_evidence())
     with pytest.raises(Unavailable, match="no sparse point lies in the held-out view"):
         METHODS["sfm_dense"](make_evidence(points=np.array([[0.0, 0, -3]])))
-    with pytest.raises(Unavailable, match="extra not installed"):
+    with pytest.raises(Unavailable, match="not built"):
         METHODS["sfm_humans"](make_evidence())
 
 

@@ -209,12 +209,12 @@ def test_every_value_that_is_missing_has_its_reason(scene, tmp_path):
         "no sparse points" in missing["sfm", "psnr_db"]
         and "no sparse points" in missing["sfm_dense", "psnr_db"]
     )
-    assert missing["sfm_humans", "psnr_db"] == "extra not installed: pose and body models"
+    assert missing["sfm_humans", "psnr_db"] == "not built: needs a pose and a body model"
     notes = {row["note"] for row in rows if row["method"] == "nn_all_times" and row["value"]}
     assert notes == {"feature: thumbnail and gradient histograms"}
     text = table.draw_table(rows, summary.summarize_all(rows))
     assert "| SfM+humans | - | - | - | - | - | - |" in text
-    assert "- SfM+humans: extra not installed: pose and body models" in text
+    assert "- SfM+humans: not built: needs a pose and a body model" in text
     assert "- LPIPS (AlexNet): no weights are given" in text
     assert "- N.N. same-time, N.N. all-time: feature: thumbnail and gradient histograms" in text
 
