@@ -22,7 +22,7 @@ from fourd.errors import InputError
 from fourd.io import Archive, atomic_folder, read_image, write_csv, write_png
 from fourd.views import read_view
 
-STAGE_VERSION = 2
+STAGE_VERSION = 3
 HOLES_COLUMNS = ("frame", "level", "hole_share", "largest_hole_share", "filled_share", "reason")
 PROGRESS_INTERVAL_S = 2.0
 

@@ -9,7 +9,7 @@ from fourd.demo.cameras import camera_at, camera_tracks, clip_times, middle_time
 from fourd.demo.options import DemoOptions, camera_names
 from fourd.demo.render import FrozenScene, label_numbers
 
-STAGE_VERSION = 1
+STAGE_VERSION = 2
 
 __all__ = [
     "STAGE_VERSION",

@@ -17,6 +17,7 @@ from fourd.demo.figures import ball_center, bounce_times
 from fourd.demo.options import DemoOptions, camera_index
 from fourd.demo.render import FrozenScene
 from fourd.io import atomic_path
+from fourd.video.encode import SAME_BYTES
 
 log = logging.getLogger(__name__)
 
@@ -142,11 +143,12 @@ def write_phone_file(path: Path | str, name: str, options: DemoOptions, without:
     phone = make_phone(name, options)
     with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
         rate = Fraction(phone.fps).limit_denominator(1001)
-        video = container.add_stream("libx264", rate=rate, options={"crf": "17", "preset": "medium"})
+        video = container.add_stream(
+            "libx264", rate=rate, options={"crf": "17", "preset": "medium", **SAME_BYTES}
+        )
         # Subsampled colour needs even sizes; one column or row is cut where the picture is odd.
         width, height = options.width // 2 * 2, options.height // 2 * 2
         video.width, video.height, video.pix_fmt = width, height, "yuv420p"
-        video.codec_context.thread_count = 1
         video.codec_context.time_base = Fraction(1, TIME_BASE)
         # 1 is BT.709 in the tables of ITU-T H.273 for all three.
         video.codec_context.color_primaries = video.codec_context.color_trc = 1

@@ -7,6 +7,6 @@ an importer nor pycolmap: readers of `cameras.json` pay nothing for them.
 from fourd.sfm.cameras import SceneCameras, read_cameras, write_cameras
 from fourd.sfm.options import SfmOptions
 
-STAGE_VERSION = 1
+STAGE_VERSION = 2
 
 __all__ = ["STAGE_VERSION", "SceneCameras", "SfmOptions", "read_cameras", "write_cameras"]

@@ -15,6 +15,10 @@ from fourd.video.colour import INTERPOLATION
 
 ENCODERS = {"h264": "libx264"}
 CONSTANT_RATE_FACTOR = 18
+# What makes x264 give the same bytes for the same frames: its decisions depend on the number of
+# threads, and its macroblock tree with B-frames reads memory that nobody wrote where a picture is
+# not a multiple of 256 columns (seen with MALLOC_PERTURB_).
+SAME_BYTES = {"threads": "1", "x264-params": "mbtree=0"}
 
 
 def encode_video(
@@ -52,8 +56,7 @@ def encode_video(
 def _add_stream(
     container: OutputContainer, encoder: str, rate: Fraction, shape: tuple[int, ...]
 ) -> av.VideoStream:
-    # One thread: x264's decisions, hence the bytes, depend on how many there are.
-    options = {"crf": str(CONSTANT_RATE_FACTOR), "preset": "medium", "threads": "1"}
+    options = {"crf": str(CONSTANT_RATE_FACTOR), "preset": "medium", **SAME_BYTES}
     stream = container.add_stream(encoder, rate=rate, options=options)
     assert isinstance(stream, av.VideoStream)
     height, width = shape[:2]

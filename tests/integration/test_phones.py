@@ -22,6 +22,7 @@ from fourd.sfm.compare import align_similarity
 from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.recover.recover import recover_cameras
 from fourd.video import read_video_frames
+from fourd.video.encode import SAME_BYTES
 from tests.conftest import Workspace
 from tests.unit.recover_films import film_of
 
@@ -40,7 +41,7 @@ BAD = {
 def write_film(path: Path, pictures: list[np.ndarray], sound: np.ndarray | None = None) -> None:
     """A film at 30 fps, with mono sound if there is any."""
     with av.open(str(path), "w") as container:
-        video = container.add_stream("libx264", rate=30, options={"crf": "18"})
+        video = container.add_stream("libx264", rate=30, options={"crf": "18", **SAME_BYTES})
         video.width, video.height, video.pix_fmt = pictures[0].shape[1], pictures[0].shape[0], "yuv420p"
         audio = None if sound is None else container.add_stream("aac", rate=SAMPLE_RATE, layout="mono")
         for index, picture in enumerate(pictures):

@@ -20,6 +20,7 @@ from fourd.sfm.recover.model import Lens, Model, to_reconstruction
 from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.recover.patches import align_patches, extract_templates
 from fourd.sfm.recover.register import register_remaining, replace_poses
+from fourd.sfm.recover.starts import rank_starts
 from fourd.sfm.recover.tracking import affine_between, cut_landmarks
 from fourd.sfm.sparse import detect_features
 from tests.unit.recover_films import draw_films, make_cameras
@@ -133,7 +134,9 @@ def test_a_camera_joins_the_model_through_landmarks_alone():
     without = {key: value for key, value in features.items() if key[0] != "cam03"}
     pairs = match_keyframes(without, lenses, options)
     three = {name: lenses[name] for name in ("cam00", "cam01", "cam02")}
-    model = map_keyframes(without, pairs, three, options)[0].supported().compact()
+    mapped = map_keyframes(without, pairs, three, options, rank_starts(pairs)[0])
+    assert mapped is not None
+    model = mapped.supported().compact()
     landmarks = cut_landmarks(model, lambda name, frame: films[name].read_gray(frame), 7)
     grown = register_remaining(model, landmarks, films, features, lenses, options)
     assert grown.cameras == ["cam00", "cam01", "cam02", "cam03"]

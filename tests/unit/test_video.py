@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from fractions import Fraction
 
 import av
@@ -175,6 +178,24 @@ def test_films_play_everywhere_and_are_reproducible(tmp_path):
         context = container.streams.video[0].codec_context
         tags = (context.color_primaries, context.color_trc, context.colorspace, context.color_range)
         assert (context.name, context.pix_fmt, tags) == ("h264", "yuv420p", (1, 1, 1, 1))
+
+
+def test_no_byte_of_a_film_comes_from_memory_nobody_wrote(tmp_path):
+    """x264 with its macroblock tree fails this: 320 columns are not a multiple of 256."""
+    code = """
+import sys
+import numpy as np
+from fourd.video import encode_video
+texture = np.random.default_rng(0).integers(0, 256, (23, 50, 3)).repeat(8, 0).repeat(8, 1).astype(np.uint8)
+encode_video(sys.argv[1], (np.roll(texture, (2 * i, 5 * i), (0, 1))[:180, :320] for i in range(32)), 30)
+"""
+    contents = set()
+    for fill in ("0", "55", "170"):
+        path = tmp_path / f"{fill}.mp4"
+        environment = {**os.environ, "MALLOC_PERTURB_": fill}
+        subprocess.run([sys.executable, "-c", code, str(path)], check=True, env=environment)
+        contents.add(path.read_bytes())
+    assert len(contents) == 1
 
 
 def test_film_appears_whole_or_not_at_all(tmp_path):

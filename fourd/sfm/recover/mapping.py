@@ -16,6 +16,8 @@ from fourd.sfm.recover.options import RecoverOptions
 SEED = 1
 # Keyframes of one film overlap much more than those of two cameras; this many neighbours link them.
 NUM_FILM_NEIGHBORS = 2
+# Between the rays of the pair that a model grows from. It is halved where that finds none.
+MIN_START_ANGLE_DEG = 4.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -103,39 +105,39 @@ def map_keyframes(
     pairs: Sequence[VerifiedPair],
     lenses: Mapping[str, Lens],
     options: RecoverOptions,
-    seed: int = SEED,
-) -> list[Model]:
-    """Models that COLMAP's incremental mapper finds, the one with most cameras first.
+    start: VerifiedPair,
+) -> Model | None:
+    """The model that COLMAP's incremental mapper grows from a pair of pictures, None if it finds none.
 
     lenses: start of the intrinsics, one COLMAP camera per name, or one for all if the options say so
-    seed: of the mapper's random samples
     Deterministic: one thread, fixed seed.
     """
     keys = sorted(features)
     camera_ids = lens_ids(lenses, options.shared_lens)
+    pipeline = _pipeline_options(options)
+    pipeline.init_image_id1, pipeline.init_image_id2 = (
+        keys.index(key) + 1 for key in (start.left, start.right)
+    )
     with tempfile.TemporaryDirectory() as folder:
-        _write_database(Path(folder) / "database.db", keys, features, pairs, lenses, camera_ids)
-        found = pycolmap.incremental_mapping(
-            Path(folder) / "database.db",
-            Path(folder),
-            Path(folder) / "models",
-            _pipeline_options(options, seed),
-        )
-    models = [
-        dataclasses.replace(_model_of(found[i], keys, lenses, camera_ids), is_lens_shared=options.shared_lens)
-        for i in sorted(found)
-    ]
-    return sorted(models, key=lambda m: (-len(m.cameras), -len(m.poses), -len(m.points)))
+        path = Path(folder) / "database.db"
+        _write_database(path, keys, features, pairs, lenses, camera_ids)
+        found = pycolmap.incremental_mapping(path, Path(folder), Path(folder) / "models", pipeline)
+    if not found:
+        return None
+    model = _model_of(found[min(found)], keys, lenses, camera_ids)
+    return dataclasses.replace(model, is_lens_shared=options.shared_lens)
 
 
-def _pipeline_options(options: RecoverOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
+def _pipeline_options(options: RecoverOptions) -> pycolmap.IncrementalPipelineOptions:
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.num_threads = 1
-    pipeline.random_seed = seed
+    pipeline.random_seed = SEED
     pipeline.extract_colors = False
+    pipeline.multiple_models = False
     pipeline.min_model_size = 2
     pipeline.min_num_matches = options.min_matches
     pipeline.mapper.init_min_num_inliers = 2 * options.min_matches
+    pipeline.mapper.init_min_tri_angle = MIN_START_ANGLE_DEG
     pipeline.mapper.abs_pose_min_num_inliers = options.min_matches
     pipeline.mapper.filter_max_reproj_error = options.max_match_error_px
     return pipeline

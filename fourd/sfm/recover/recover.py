@@ -33,25 +33,18 @@ from fourd.sfm.recover.frames import (
     longest_run,
     track_films,
 )
-from fourd.sfm.recover.mapping import VerifiedPair, map_keyframes, match_keyframes
+from fourd.sfm.recover.mapping import VerifiedPair, match_keyframes
 from fourd.sfm.recover.model import ImageKey, Lens, Model
 from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.recover.register import (
     describe_landmarks,
     register_film,
     register_remaining,
-    replace_poses,
 )
+from fourd.sfm.recover.starts import map_from_best_starts
 from fourd.sfm.recover.tracking import Landmarks, cut_landmarks, observe, refine_pose
 
 log = logging.getLogger(__name__)
-
-# A model counts as better explained by distortion only if that gains this share of observations.
-DISTORTION_GAIN = 1.05
-# A mapper that starts from an unlucky pair ends in pieces, or bent. It starts anew until two models have
-# all pictures that match those of another camera, and about as many observations as the best has.
-MAX_STARTS = 6
-SAME_MODEL = 0.9
 
 
 def recover_cameras(
@@ -75,7 +68,7 @@ def recover_cameras(
     features = _detect(inputs, options)
     lenses = _start_lenses(inputs, options)
     pairs = match_keyframes(features, lenses, options)
-    models = _map(features, pairs, lenses, options)
+    models = map_from_best_starts(features, pairs, lenses, options)
     _check_models(models, inputs, features, lenses, pairs, options)
     mapped, landmarks = _refine_keyframes(models[0], inputs, options)
     starts = _like_finished(lenses, mapped)
@@ -132,56 +125,6 @@ def _start_lenses(films: Mapping[str, Film], options: RecoverOptions) -> dict[st
             "bring the films to one size"
         )
     return dict.fromkeys(lenses, next(iter(lenses.values())))
-
-
-def _map(
-    features: Mapping[ImageKey, Features],
-    pairs: Sequence[VerifiedPair],
-    lenses: Mapping[str, Lens],
-    options: RecoverOptions,
-) -> list[Model]:
-    """Models of the keyframes, the first one adjusted.
-
-    A distorting lens is tried too: without it a mapper loses the corners. Only adjusted models compare:
-    the mapper's own leave observations to chance.
-    """
-    linked = {key for pair in pairs if pair.left[0] != pair.right[0] for key in (pair.left, pair.right)}
-    found, num_observed = [], []
-    for seed in range(1, MAX_STARTS + 1):
-        tried = []
-        for radial in ((), (0.0,)):
-            start = {name: dataclasses.replace(lens, radial=radial) for name, lens in lenses.items()}
-            models = map_keyframes(features, pairs, start, options, seed)
-            tried += [[_adjust_corners(models[0], options), *models[1:]]] if models else []
-        if not found or _most_observed(tried) > _most_observed(found):
-            found = tried
-        num_observed += [len(m[0].obs_px) for m in tried if linked <= set(m[0].poses)]
-        if sum(number > SAME_MODEL * max(num_observed) for number in num_observed) >= 2:
-            break
-    if len(found) < 2:
-        return found[0] if found else []
-    plain, distorted = found
-    sizes = [(len(m[0].cameras), len(m[0].poses)) for m in found]
-    gain = len(distorted[0].obs_px) / max(1, len(plain[0].obs_px))
-    return distorted if sizes[1] > sizes[0] or (sizes[1] == sizes[0] and gain > DISTORTION_GAIN) else plain
-
-
-def _most_observed(tried: Sequence[Sequence[Model]]) -> tuple[int, int]:
-    """Pictures and observations of the largest first model."""
-    return max(((len(models[0].poses), len(models[0].obs_px)) for models in tried), default=(0, 0))
-
-
-def _adjust_corners(model: Model, options: RecoverOptions) -> Model:
-    """The mapper's model, adjusted, without outliers and with no picture in a pose it cannot leave.
-
-    A model of one camera supports no point and stays as it is.
-    """
-    if len(model.cameras) < 2:
-        return model
-    scale_px = options.max_match_error_px / 3
-    model = replace_poses(adjust(model, scale_px), options.max_error_px)
-    model = adjust(drop_outliers(model, options.max_match_error_px), scale_px)
-    return model.supported().compact()
 
 
 def _check_models(
