@@ -233,20 +233,7 @@ def _path_down(
     for x in range(first.shape[0]):
         lowest = least[x]
         jump = _i16(lowest + price[x])
-        least_here = _i16(32000)
-        for band in range(NUM_BANDS):
-            one = before[x, 0, _around(first[x, band], first_before[x, 0])]
-            other = before[x, 1, _around(first[x, band], first_before[x, 1])]
-            for d in range(BAND_PX):
-                lower = min(one[d], other[d])
-                same = min(one[d + 1], other[d + 1])
-                higher = min(one[d + 2], other[d + 2])
-                best = min(min(same, jump), _i16(min(lower, higher) + _SMALL))
-                value = _i16(costs[x, band, d] + _i16(best - lowest))
-                path[x, band, _MARGIN + d] = value
-                total[x, band, d] = _i16(total[x, band, d] + value)
-                least_here = min(least_here, value)
-        least[x] = least_here
+        least[x] = _step(before[x], first_before[x], costs[x], first[x], jump, lowest, path[x], total[x])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -267,20 +254,35 @@ def _path_along(
         before = x if i == 0 else (x - 1 if forward else x + 1)
         jump = _i16(lowest + price[max(x, before)]) if i > 0 else _i16(0)
         here, there = i % 2, (i + 1) % 2
-        least = _i16(32000)
-        for band in range(NUM_BANDS):
-            one = line[here, 0, _around(first[x, band], first[before, 0])]
-            other = line[here, 1, _around(first[x, band], first[before, 1])]
-            for d in range(BAND_PX):
-                lower = min(one[d], other[d])
-                same = min(one[d + 1], other[d + 1])
-                higher = min(one[d + 2], other[d + 2])
-                best = min(min(same, jump), _i16(min(lower, higher) + _SMALL))
-                value = _i16(costs[x, band, d] + _i16(best - lowest))
-                line[there, band, _MARGIN + d] = value
-                total[x, band, d] = _i16(total[x, band, d] + value)
-                least = min(least, value)
-        lowest = least
+        lowest = _step(line[here], first[before], costs[x], first[x], jump, lowest, line[there], total[x])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _step(
+    before: np.ndarray,
+    first_before: np.ndarray,
+    costs: np.ndarray,
+    first: np.ndarray,
+    jump: np.int16,
+    lowest: np.int16,
+    path: np.ndarray,
+    total: np.ndarray,
+) -> np.int16:
+    """One pixel of a path after the one before it, to `path` and added to `total`. Returns its least cost."""
+    least = _i16(32000)
+    for band in range(NUM_BANDS):
+        one = before[0, _around(first[band], first_before[0])]
+        other = before[1, _around(first[band], first_before[1])]
+        for d in range(BAND_PX):
+            lower = min(one[d], other[d])
+            same = min(one[d + 1], other[d + 1])
+            higher = min(one[d + 2], other[d + 2])
+            best = min(min(same, jump), _i16(min(lower, higher) + _SMALL))
+            value = _i16(costs[band, d] + _i16(best - lowest))
+            path[band, _MARGIN + d] = value
+            total[band, d] = _i16(total[band, d] + value)
+            least = min(least, value)
+    return least
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -37,14 +37,16 @@ def select_pairs(cameras: Mapping[str, Camera], options: SfmOptions) -> list[tup
     return [pair for pair in itertools.combinations(cameras, 2) if frozenset(pair) in wanted]
 
 
-def detect_features(image: np.ndarray, max_features: int) -> tuple[np.ndarray, np.ndarray]:
+def detect_features(
+    image: np.ndarray, max_features: int, min_contrast: float = 0.04
+) -> tuple[np.ndarray, np.ndarray]:
     """SIFT: (N, 2) float64 px, our pixel centres, and (N, 128) float32 descriptors of whole numbers.
 
-    image: (H, W, 3) uint8 RGB
+    image: (H, W, 3) uint8 RGB;  min_contrast: of an extremum, its default is the detector's own
     """
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     keypoints, descriptors = cv2.SIFT.create(
-        nfeatures=max_features, enable_precise_upscale=True
+        nfeatures=max_features, contrastThreshold=min_contrast, enable_precise_upscale=True
     ).detectAndCompute(gray, None)  # type: ignore[call-overload]
     if descriptors is None or len(keypoints) == 0:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)

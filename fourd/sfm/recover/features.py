@@ -2,19 +2,18 @@
 
 import dataclasses
 
-import cv2
 import numpy as np
 
 from fourd.errors import InputError
 from fourd.sfm.recover.learned import load_learned_features
 from fourd.sfm.recover.options import RecoverOptions
-from fourd.sfm.sparse import match_descriptors
+from fourd.sfm.sparse import detect_features, match_descriptors
 
 METHODS = ("sift", "aliked")
-# The detector's own, and half of it for pictures with few corners (less than a part of those allowed):
-# the few that two distant cameras share decide whether the first model stands. Where there are many,
-# weak ones make the poses a quarter worse.
-_MIN_CONTRAST, _LEAST_CONTRAST = 0.04, 0.02
+# Half of the detector's own, for pictures with few corners (less than a part of those allowed): the few
+# that two distant cameras share decide whether the first model stands. Where there are many, weak ones
+# make the poses a quarter worse.
+_LEAST_CONTRAST = 0.02
 _FEW_FEATURES = 0.25
 
 
@@ -35,23 +34,10 @@ def find_features(image: np.ndarray, options: RecoverOptions) -> Features:
     if options.features == "aliked":
         networks = load_learned_features(options.learned_weights)
         return Features(*networks.detect(image, options.max_features))
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    found = _detect_sift(gray, options.max_features, _MIN_CONTRAST)
-    if len(found.pixels) >= _FEW_FEATURES * options.max_features:
-        return found
-    return _detect_sift(gray, options.max_features, _LEAST_CONTRAST)
-
-
-def _detect_sift(gray: np.ndarray, max_features: int, min_contrast: float) -> Features:
-    keypoints, descriptors = cv2.SIFT.create(
-        nfeatures=max_features, contrastThreshold=min_contrast, enable_precise_upscale=True
-    ).detectAndCompute(gray, None)  # type: ignore[call-overload]
-    if descriptors is None or len(keypoints) == 0:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    rows = np.array([(*k.pt, k.size, k.angle) for k in keypoints])
-    # The detector's order depends on its threads; the results must not.
-    order = np.lexsort(rows.T[::-1])
-    return Features(rows[order, :2].astype(np.float64), descriptors[order].astype(np.float32))
+    pixels, descriptors = detect_features(image, options.max_features)
+    if len(pixels) < _FEW_FEATURES * options.max_features:
+        pixels, descriptors = detect_features(image, options.max_features, _LEAST_CONTRAST)
+    return Features(pixels, descriptors)
 
 
 def match_features(
