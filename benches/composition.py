@@ -26,9 +26,9 @@ import numpy as np
 
 from benches.pareto import plot_curves
 from fourd import cli, io, metrics
-from fourd.composition import CompositionOptions, data
+from fourd.composition import CascadeOptions, CompositionOptions, data
 from fourd.composition.__main__ import Sources, target_reader
-from fourd.composition.infer import CONSENSUS, STATIC, paste_images, run_network
+from fourd.composition.infer import CONSENSUS, STATIC, compose_frame, paste_images
 from fourd.composition.model import CompositionNet, resolve_precision
 from fourd.composition.train import Trainer, train_step
 from fourd.config import SCHEMA_FOLDER, load_yaml, spread_frames
@@ -52,20 +52,23 @@ COLUMNS = (
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """Options that differ from the bench's, and which estimates feed the six streams.
+    """Options that differ from the bench's, which estimates feed the six streams, and the number of levels.
 
-    None: as the options say
+    test_streams: None = as the options say
+    num_levels: of two, which are trained in turns, the coarser fills every hole of the finer one's inputs
     """
 
     changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     training_streams: Streams = data.TRAINING_STREAMS
     test_streams: Streams | None = None
+    num_levels: int = 1
 
 
 VARIANTS = {
     "default": Variant(),
     "paper": Variant(PRESETS["paper"]),
     "streams_paper": Variant({"streams": "paper"}),
+    "cascade": Variant(num_levels=2),
     "one_stream": Variant({}, ONE, ONE),
     "input_closest": Variant({}, test_streams=CLOSEST),
     "input_median": Variant({}, test_streams=MEDIAN),
@@ -80,7 +83,8 @@ VARIANTS = {
     "rate_0.0005": Variant({"learning_rate": 5e-4, "warmup_steps": 0}),
     "no_warmup": Variant({"warmup_steps": 0}),
     "not_averaged": Variant({"average_weights": False}),
-    "not_enlarged": Variant({"max_scale": 1.0}),
+    "not_resized": Variant({"min_scale": 1.0}),
+    "enlarged": Variant({"min_scale": 1.0, "max_scale": 1.5}),
 }
 
 
@@ -98,9 +102,10 @@ class HeldOutFrame:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Event:
-    """All samples of a scene: those to train on, and held-out frames by camera."""
+    """All samples of a scene: those to train on, also at half the size, and held-out frames by camera."""
 
     samples: data.SampleSet
+    coarse: data.SampleSet
     heldout: dict[str, list[HeldOutFrame]]
 
 
@@ -120,11 +125,14 @@ def read_event(folder: Path, labels: Path | None) -> Event:
         {cam: folder / "frames" / "cameras" / f"{cam}.npz" for cam in scene.inputs},
         folder / "sfm" / "cameras.json",
     )
-    cache_mb = CompositionOptions().cache_mb
-    samples = data.SampleSet(sources.foreground, sources.background, target_reader(sources), 1, cache_mb)
+    cache_mb, read_target = CompositionOptions().cache_mb, target_reader(sources)
+    samples, coarse = (
+        data.SampleSet(sources.foreground, sources.background, read_target, factor, cache_mb)
+        for factor in (1, 2)
+    )
     samples.fill_cache()
     heldout = {cam: list(read_heldout(folder, scene, cam, labels)) for cam in scene.heldout}
-    return Event(samples, {cam: frames for cam, frames in heldout.items() if frames})
+    return Event(samples, coarse, {cam: frames for cam, frames in heldout.items() if frames})
 
 
 def read_heldout(folder: Path, scene: SceneCameras, cam: str, labels: Path | None) -> Iterator[HeldOutFrame]:
@@ -178,7 +186,7 @@ def average_frames(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def measure_baselines(frames: Sequence[HeldOutFrame]) -> dict[str, tuple[dict[str, float], np.ndarray]]:
-    """Inst and Inst over background, as `measure_network`."""
+    """Inst and Inst over background, as `measure_networks`."""
     images = {
         "inst": [frame.images[CONSENSUS, ..., :3] for frame in frames],
         "paste": [paste_images(frame.images) for frame in frames],
@@ -189,32 +197,45 @@ def measure_baselines(frames: Sequence[HeldOutFrame]) -> dict[str, tuple[dict[st
     }
 
 
-def measure_network(
-    network: CompositionNet, frames: Sequence[HeldOutFrame]
+def compose_images(networks: Sequence[CompositionNet], images: np.ndarray) -> np.ndarray:
+    """What the levels make of the estimates in (7, H, W, 4) uint8, every hole filled by the coarser one."""
+    arrays: dict[str, dict[str, np.ndarray]] = {"foreground": {}, "background": {}}
+    for (kind, key), image in zip(data.ESTIMATES, images[: data.TARGET], strict=True):
+        arrays[kind] |= {f"{key}_rgb": image[..., :3], f"{key}_valid": image[..., 3] > 0}
+    return compose_frame(networks, 0, arrays["foreground"], arrays["background"], CascadeOptions(0, 0))[0]
+
+
+def measure_networks(
+    networks: Sequence[CompositionNet], frames: Sequence[HeldOutFrame]
 ) -> tuple[dict[str, float], np.ndarray]:
     """Means over frames, and the picture of the middle one."""
-    found = [run_network(network, frame.images) for frame in frames]
+    found = [compose_images(networks, frame.images) for frame in frames]
     return average_frames(list(map(measure_image, found, frames))), found[len(found) // 2]
 
 
 def train_variant(
     event: Event, variant: Variant, options: CompositionOptions, marks: Sequence[float]
-) -> Iterator[tuple[dict[str, Any], CompositionNet]]:
-    """What one variant's training has taken and its network, at every mark (s of processor time)."""
+) -> Iterator[tuple[dict[str, Any], list[CompositionNet]]]:
+    """What one variant's training has taken and its networks, at every mark (s of processor time)."""
     options = dataclasses.replace(options, **variant.changes)
     options = dataclasses.replace(options, precision=resolve_precision(options.precision, "cpu"))
-    trainer = Trainer(0, options, "cpu")
-    network = trainer.network
-    if variant.test_streams is not None:
-        network.test_streams = variant.test_streams
+    sets = (event.coarse, event.samples)[-variant.num_levels :]
+    levels = [(samples, Trainer(level, options, "cpu")) for level, samples in enumerate(sets)]
+    networks = [trainer.network for _, trainer in levels]
+    for network in networks:
+        network.test_streams = variant.test_streams or network.test_streams
     spent = {"seconds": 0.0, "cpu_seconds": 0.0}
     for mark in sorted(marks):
         start, cpu_start = time.monotonic() - spent["seconds"], time.process_time() - spent["cpu_seconds"]
         while time.process_time() - cpu_start < mark:
-            train_step(trainer, event.samples, event.samples.ids, options, variant.training_streams)
+            for samples, trainer in levels:
+                train_step(trainer, samples, samples.ids, options, variant.training_streams)
         spent = {"seconds": time.monotonic() - start, "cpu_seconds": time.process_time() - cpu_start}
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        yield {"mark_s": mark, "steps": trainer.counters["step"], **spent, "peak_rss_mb": peak}, network
+        yield (
+            {"mark_s": mark, "steps": levels[-1][1].counters["step"], **spent, "peak_rss_mb": peak},
+            networks,
+        )
 
 
 def measure_variants(
@@ -236,9 +257,9 @@ def measure_variants(
         for name, (scores, picture) in found.items():
             keep(name, view, {"mark_s": 0, "steps": 0, **scores}, picture)
     for name in names:
-        for cost, network in train_variant(event, VARIANTS[name], options, marks):
+        for cost, networks in train_variant(event, VARIANTS[name], options, marks):
             for view, frames in event.heldout.items():
-                scores, picture = measure_network(network, frames)
+                scores, picture = measure_networks(networks, frames)
                 keep(name, view, cost | scores, picture)
     return rows, pictures
 
@@ -279,7 +300,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser.parse_args(argv)
     cli.set_num_threads(1)
     event = read_event(args.scene, args.labels)
-    options = CompositionOptions(num_filters=(args.num_filters,), crop=args.crop, seed=args.seed)
+    options = CompositionOptions(num_filters=(args.num_filters,) * 3, crop=args.crop, seed=args.seed)
     rows, pictures = measure_variants(event, args.variants, options, args.marks)
     io.write_csv(args.output / "composition.csv", COLUMNS, rows)
     trained = average_views([row for row in rows if row["steps"]])

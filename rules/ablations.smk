@@ -6,11 +6,13 @@ ABLATIONS = [
     "l1",
     "l1_adversarial",
     "l1_adversarial_frequency",
+    "cascade",
     "one_stream",
     "streams_paper",
     "input_closest",
     "input_median",
-    "not_enlarged",
+    "not_resized",
+    "enlarged",
 ]
 
 
@@ -27,6 +29,7 @@ rule ablations:
             for cam in SCENE.heldout
             for chunk in chunks_of_view(cam)
         ],
+        labels=[f"{SCENE.labels}/{cam}" for cam in SCENE.heldout] if SCENE.labels else [],
     output:
         table=f"<results>/{SCENE.name}/ablations/composition.csv",
         picture=f"<results>/{SCENE.name}/ablations/composition.png",

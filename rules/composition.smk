@@ -11,6 +11,7 @@ rule train_level:
     output:
         model="<results>/{scene}/composition/{level}/model.pt",
         table="<results>/{scene}/composition/{level}/train.csv",
+        picture="<results>/{scene}/composition/{level}/validation.png",
     log:
         "<logs>/{scene}/train_level/{level}.log",
     benchmark:
@@ -30,4 +31,4 @@ rule train_level:
         " --num-levels {params.num_levels} --views {input.views} --cameras {input.cameras}"
         " --films {input.films} --foreground {input.foreground} --background {input.background}"
         " {params.options} --threads {threads} --output-model {output.model}"
-        " --output-log {output.table} 2> >(tee {log} >&2)"
+        " --output-log {output.table} --output-picture {output.picture} 2> >(tee {log} >&2)"

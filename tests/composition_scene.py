@@ -66,7 +66,8 @@ def write_scene(folder):
 
 
 def train_model(sources, folder, options=TINY, level=0, num_levels=1):
-    run(sources, level, num_levels, folder / "model.pt", folder / "train.csv", options, "cpu")
+    outputs = folder / "model.pt", folder / "train.csv", folder / "validation.png"
+    run(sources, level, num_levels, *outputs, options, "cpu")
     return torch.load(folder / "model.pt", weights_only=True)["state_dict"]
 
 
@@ -80,6 +81,7 @@ def command_line(sources, folder, options):
     words += ["--background", *map(str, sources.background), "--cameras", str(sources.cameras)]
     words += ["--films", *(f"{cam}={path}" for cam, path in sources.films.items())]
     words += ["--output-model", str(folder / "model.pt"), "--output-log", str(folder / "train.csv")]
+    words += ["--output-picture", str(folder / "validation.png")]
     for key, value in dataclasses.asdict(options).items():
         values = value if isinstance(value, tuple) else ["none" if value is None else value]
         words += ["--" + key.replace("_", "-"), *map(str, values)]

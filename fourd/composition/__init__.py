@@ -1,12 +1,12 @@
 """Self-supervised composition of instantaneous foreground and static background (section 3.3, 4).
 
 `model` is the network, `losses` what it minimises, `data` the samples, `train` the page that fits
-it to a scene, `infer` its use: one frame through the levels, coarse to fine.
+it to a scene, `validation` how well that goes, `infer` its use: one frame through the levels, coarse to fine.
 """
 
 import dataclasses
 
-STAGE_VERSION = 3
+STAGE_VERSION = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,14 +25,18 @@ class CompositionOptions:
     epochs: int = 10
     learning_rate: float = 1e-3
     warmup_steps: int = 100
-    max_scale: float = 1.5
+    min_scale: float = 0.5
+    max_scale: float = 1.0
     crop: int | None = None
     validation_samples: int = 4
+    validation_camera: str | None = None
+    patience: int | None = None
     seed: int = 0
     precision: str = "auto"
     max_minutes: float | None = None
     checkpoint_s: float = 60.0
     cache_mb: int = 1024
+    tensorboard: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,9 +14,10 @@ import torch
 from fourd import cli, io
 from fourd.composition import STAGE_VERSION, CompositionOptions, data
 from fourd.composition.checkpoint import Checkpoint, StopRequest, save_torch
-from fourd.composition.forecast import check_memory
+from fourd.composition.forecast import plan_memory
 from fourd.composition.model import HEADS, TEST_STREAMS, resolve_precision
 from fourd.composition.train import COLUMNS, Trainer, train
+from fourd.composition.validation import epoch_report
 from fourd.errors import InputError
 from fourd.image import undistort
 from fourd.ingest import open_camera
@@ -26,7 +27,10 @@ from fourd.views import LEFT_OUT, View, read_view
 log = logging.getLogger("fourd.composition")
 
 # What may change between a run and its continuation without changing the weights at a step.
-NOT_IN_FINGERPRINT = ("epochs", "max_minutes", "checkpoint_s", "cache_mb")
+NOT_IN_FINGERPRINT = ("epochs", "patience", "max_minutes", "checkpoint_s", "cache_mb", "tensorboard")
+
+# Below it, resampling would skip pixels.
+MIN_SCALE = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +96,7 @@ def run(
     num_levels: int,
     model_path: Path,
     log_path: Path,
+    picture_path: Path,
     options: CompositionOptions,
     device: str,
 ) -> None:
@@ -106,7 +111,7 @@ def run(
     samples = data.SampleSet(
         sources.foreground, sources.background, target_reader(sources), factor, options.cache_mb
     )
-    split = data.split_validation(samples.ids, options.validation_samples)
+    split = data.split_validation(samples.ids, options.validation_samples, options.validation_camera)
     trainer = Trainer(level, options, device)
     save = Checkpoint(model_path.with_name("checkpoint.pt"), fingerprint)
     save.restore(trainer, options.epochs * len(split[0]))
@@ -114,7 +119,10 @@ def run(
     num_cached = samples.fill_cache()
     height, width = samples.images(samples.ids[0]).shape[1:3]
     size = (min(height, options.crop or height), min(width, options.crop or width))
-    log.info(check_memory(trainer.network_arguments, size, options.precision, device))
+    trainer.generator.is_recomputed, line = plan_memory(
+        trainer.network_arguments, size, options.precision, device
+    )
+    log.info(line)
     num_parameters = sum(p.numel() for p in trainer.generator.parameters())
     log.info(
         "%d samples in memory; %d parameters, on %s in %s",
@@ -123,8 +131,10 @@ def run(
         device,
         options.precision,
     )
+    events = model_path.with_name("events") if options.tensorboard else None
+    report = epoch_report(picture_path, events, trainer.counters["step"])
     with StopRequest() as stop:
-        rows = train(trainer, samples, split, options, save, stop)
+        rows = train(trainer, samples, split, options, save, stop, report)
     io.write_csv(log_path, COLUMNS, rows)
     save_torch(
         model_path,
@@ -149,9 +159,10 @@ def check_options(options: CompositionOptions) -> None:
             raise InputError(f"expected {name} above 0, got {value}: change it in the configuration")
     if options.head not in HEADS:
         raise InputError(f"expected head to be one of {', '.join(HEADS)}, got {options.head!r}")
-    if options.max_scale < 1:
+    if not MIN_SCALE <= options.min_scale <= options.max_scale:
         raise InputError(
-            f"expected max_scale of at least 1, got {options.max_scale}: inputs are only enlarged"
+            f"expected min_scale of at least {MIN_SCALE} and at most max_scale, got {options.min_scale} and "
+            f"{options.max_scale}: change them in the configuration"
         )
     if options.streams not in TEST_STREAMS:
         raise InputError(f"expected streams to be one of {', '.join(TEST_STREAMS)}, got {options.streams!r}")
@@ -173,6 +184,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     command.add_argument("--cameras", type=Path, required=True, help="sfm/cameras.json")
     command.add_argument("--output-model", type=Path, required=True)
     command.add_argument("--output-log", type=Path, required=True)
+    command.add_argument("--output-picture", type=Path, required=True)
     command.add_argument("--threads", type=int, default=1)
     command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     cli.add_options(command, CompositionOptions)
@@ -194,7 +206,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         tuple(args.views), tuple(args.foreground), tuple(args.background), dict(args.films), args.cameras
     )
     options = cli.options_from_args(CompositionOptions, args)
-    run(sources, args.level, args.num_levels, args.output_model, args.output_log, options, device)
+    outputs = args.output_model, args.output_log, args.output_picture
+    run(sources, args.level, args.num_levels, *outputs, options, device)
 
 
 if __name__ == "__main__":

@@ -100,21 +100,23 @@ def sample_order(num_samples: int, epoch: int, seed: int) -> list[int]:
     return np.random.default_rng([_ORDER, seed, epoch]).permutation(num_samples).tolist()
 
 
-def augment(images: np.ndarray, crop: int | None, max_scale: float, seed: int, step: int) -> np.ndarray:
-    """A random crop of the randomly enlarged sample, the same for all its images.
+def augment(
+    images: np.ndarray, crop: int | None, scales: tuple[float, float], seed: int, step: int
+) -> np.ndarray:
+    """A random crop of the randomly resized sample, the same for all its images.
 
     images: (N, H, W, 4) uint8, 0 where invalid
-    crop: side of the crop, px, at most the picture; None = its size
-    max_scale: factor of enlargement is uniform in [1, max_scale]
+    crop: side of the crop, px, at most the resized picture and at most the picture; None = as large as that
+    scales: the factor is uniform between these two
     Returns (N, h, w, 4) float32, 0-255, alpha 0 or 255. A function of its arguments alone, so that
     training resumed at a step draws what it would have drawn.
     """
     height, width = images.shape[1:3]
-    out_h, out_w = (min(height, crop), min(width, crop)) if crop else (height, width)
     rng = np.random.default_rng([_AUGMENTATION, seed, step])
-    scale = rng.uniform(1.0, max_scale)
+    scale = rng.uniform(*scales)
+    out_h, out_w = (min(max(1, int(side * min(scale, 1))), crop or side) for side in (height, width))
     top, left = rng.uniform(size=2) * (height - out_h / scale, width - out_w / scale)
-    if max_scale == 1.0:
+    if scales == (1.0, 1.0):
         y, x = round(top), round(left)
         return images[:, y : y + out_h, x : x + out_w].astype(np.float32)
     # Only what is seen is resampled, with a pixel around it for the interpolation.
@@ -251,15 +253,31 @@ def _view_name(archive: Archive) -> str:
     return archive.meta["view"]
 
 
-def split_validation(ids: Sequence[SampleId], num_wanted: int) -> tuple[list[SampleId], list[SampleId]]:
+def split_validation(
+    ids: Sequence[SampleId], num_wanted: int, cam: str | None = None
+) -> tuple[list[SampleId], list[SampleId]]:
     """Samples to train on and samples kept apart, evenly spread over cameras and frames.
 
-    At most a tenth is kept apart, so a tiny set is trained on whole.
+    At most a tenth is kept apart, so a tiny set is trained on whole. cam: a camera that is not trained on
+    at all; the samples kept apart are of its frames, as many as wanted.
+    Raises InputError for a camera without samples, or the only one.
     """
-    num_apart = min(num_wanted, len(ids) // 10)
-    apart = {int((i + 0.5) * len(ids) / num_apart) for i in range(num_apart)}
-    training = [sample for i, sample in enumerate(ids) if i not in apart]
-    return training, [sample for i, sample in enumerate(ids) if i in apart]
+    if cam is not None:
+        of_camera = [sample for sample in ids if sample.cam == cam]
+        if not of_camera or len(of_camera) == len(ids):
+            raise InputError(
+                f"expected validation_camera to be one of several input cameras, got {cam!r} of "
+                f"{sorted({sample.cam for sample in ids})}: change it in the configuration"
+            )
+        others = [sample for sample in ids if sample.cam != cam]
+        return others, spread_over(of_camera, min(num_wanted, len(of_camera)))
+    apart = spread_over(ids, min(num_wanted, len(ids) // 10))
+    return [sample for sample in ids if sample not in apart], apart
+
+
+def spread_over(ids: Sequence[SampleId], num: int) -> list[SampleId]:
+    """So many of the samples, evenly spread."""
+    return [ids[int((i + 0.5) * len(ids) / num)] for i in range(num)]
 
 
 def fingerprint(facts: Mapping[str, object], files: Sequence[Path]) -> str:

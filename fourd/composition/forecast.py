@@ -9,8 +9,10 @@ from fourd.composition.model import NUM_STREAMS, STREAM_CHANNELS, CompositionNet
 from fourd.errors import InputError
 
 # Peak of a step over what float32 would save for its backward pass, measured on a CPU at 270 and 540
-# lines: 1.16 to 1.30 in float32, 0.71 to 0.90 in bfloat16.
+# lines: 1.10 to 1.32 in float32, 0.63 to 0.90 in bfloat16; with activations computed twice 0.64 to 0.91 and
+# 0.42 to 0.64.
 _PEAK_SHARE = {"float32": 1.3, "bfloat16": 0.9}
+_RECOMPUTED_SHARE = {"float32": 0.95, "bfloat16": 0.65}
 
 
 def count_saved_bytes(arguments: Mapping[str, Any], size: tuple[int, int]) -> int:
@@ -36,12 +38,15 @@ def count_saved_bytes(arguments: Mapping[str, Any], size: tuple[int, int]) -> in
     return sum(sizes.values())
 
 
-def forecast_bytes(arguments: Mapping[str, Any], size: tuple[int, int], precision: str) -> int:
+def forecast_bytes(
+    arguments: Mapping[str, Any], size: tuple[int, int], precision: str, is_recomputed: bool = False
+) -> int:
     """About how much memory a training step takes at its peak, without the samples.
 
-    precision: of `PRECISIONS`;  the others as `count_saved_bytes`
+    precision: of `PRECISIONS`;  is_recomputed: see `CompositionNet`;  the others as `count_saved_bytes`
     """
-    return int(_PEAK_SHARE[precision] * count_saved_bytes(arguments, size))
+    share = (_RECOMPUTED_SHARE if is_recomputed else _PEAK_SHARE)[precision]
+    return int(share * count_saved_bytes(arguments, size))
 
 
 def free_bytes(device: str) -> int | None:
@@ -56,12 +61,18 @@ def free_bytes(device: str) -> int | None:
         return None
 
 
-def check_memory(arguments: Mapping[str, Any], size: tuple[int, int], precision: str, device: str) -> str:
-    """A line about the memory to come; arguments as `forecast_bytes`.
+def plan_memory(
+    arguments: Mapping[str, Any], size: tuple[int, int], precision: str, device: str
+) -> tuple[bool, str]:
+    """Whether activations have to be computed twice for a step to fit, and a line about the memory to come.
 
-    Raises InputError if the device has less.
+    Arguments as `forecast_bytes`. Raises InputError if the device has less even then.
     """
-    needed, free = forecast_bytes(arguments, size, precision), free_bytes(device)
+    free = free_bytes(device)
+    needed = forecast_bytes(arguments, size, precision)
+    is_recomputed = free is not None and needed > free
+    if is_recomputed:
+        needed = forecast_bytes(arguments, size, precision, is_recomputed)
     if free is not None and needed > free:
         raise InputError(
             f"training on {size[1]}x{size[0]} px needs about {needed / 2**30:.1f} GiB, {device} has "
@@ -69,7 +80,10 @@ def check_memory(arguments: Mapping[str, Any], size: tuple[int, int], precision:
             "less, or fewer num_filters"
         )
     left = "unknown" if free is None else f"{free / 2**30:.1f} GiB"
-    return f"a step takes about {needed / 2**30:.2f} GiB of memory at its peak ({left} free)"
+    how = ", with activations computed twice" if is_recomputed else ""
+    return is_recomputed, (
+        f"a step takes about {needed / 2**30:.2f} GiB of memory at its peak{how} ({left} free)"
+    )
 
 
 def _fitting_crop(size: tuple[int, int], needed: int, free: int) -> int:

@@ -1,11 +1,13 @@
 """The network: three foreground and three background streams, a U-Net, an image (figures 7 to 9)."""
 
 import contextlib
+from collections.abc import Callable
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from fourd.errors import InputError
 
@@ -21,6 +23,8 @@ PRECISIONS = ("float32", "bfloat16")
 # background, then what only training sees.
 PASTE_ORDER = (0, 3, 4, 5, 1, 2)
 PAD_BASE = 64
+
+RunBlock = Callable[[nn.Module, Tensor], Tensor]
 
 
 def autocast(device: str, precision: str) -> contextlib.AbstractContextManager:
@@ -92,15 +96,18 @@ class UNet(nn.Module):
         self.up = nn.ModuleList(nn.ConvTranspose2d(2 * a, a, 2, stride=2) for a in widths[:-1])
         self.merge = nn.ModuleList(convolutions([2 * a, a, a]) for a in widths[:-1])
 
-    def forward(self, features: Tensor) -> Tensor:
-        """(B, num_in, H, W) to (B, width, H, W); H and W are multiples of 2**depth."""
+    def forward(self, features: Tensor, run_block: RunBlock) -> Tensor:
+        """(B, num_in, H, W) to (B, width, H, W); H and W are multiples of 2**depth.
+
+        run_block: calls a block with its input, see `CompositionNet.run_block`
+        """
         skips: list[Tensor] = []
         for block in self.down:
-            features = block(F.max_pool2d(skips[-1], 2) if skips else features)
+            features = run_block(block, F.max_pool2d(skips[-1], 2) if skips else features)
             skips.append(features)
         for scale in reversed(range(len(self.up))):
             joined = torch.cat([skips[scale], self.up[scale](features)], dim=1)
-            features = self.merge[scale](joined)
+            features = run_block(self.merge[scale], joined)
         return features
 
 
@@ -114,7 +121,12 @@ class CompositionNet(nn.Module):
                  weights over the six inputs and an additive correction
     level:       0 is the coarsest; it sets the padding
     streams:     of `TEST_STREAMS`; `test_streams` says which estimates it is to be given at test
+
+    With `is_recomputed` the backward pass computes each block's activations again instead of keeping
+    them: the same gradients, in less memory and more time.
     """
+
+    is_recomputed = False
 
     def __init__(
         self, num_filters: int, unet_width: int, depth: int, head: str, level: int, streams: str = "all"
@@ -134,6 +146,11 @@ class CompositionNet(nn.Module):
         if head == "blend":
             nn.init.zeros_(last.weight)
 
+    def run_block(self, block: nn.Module, features: Tensor) -> Tensor:
+        if self.is_recomputed and torch.is_grad_enabled():
+            return checkpoint(block, features, use_reentrant=False, preserve_rng_state=False)
+        return block(features)
+
     def forward(self, streams: Tensor, precision: str = "float32") -> Tensor:
         """(B, 6, 4, H, W) in [0, 1] to (B, 3, H, W), about [0, 1], float32.
 
@@ -144,8 +161,9 @@ class CompositionNet(nn.Module):
         size = (streams.shape[-2], streams.shape[-1])
         padded = pad(streams, padded_size(*size, self.level))
         with autocast(streams.device.type, precision):
-            encoded = [stream(padded[:, i]) for i, stream in enumerate(self.streams)]
-            features = self.output[:-1](self.unet(torch.cat(encoded, dim=1)))
+            encoded = [self.run_block(stream, padded[:, i]) for i, stream in enumerate(self.streams)]
+            features = self.unet(torch.cat(encoded, dim=1), self.run_block)
+            features = self.run_block(self.output[:-1], features)
         # Always in full precision: 8 bits of mantissa are coarser than a grey level.
         decoded = crop(self.output[-1](features.to(streams.dtype)), size)
         return decoded if self.head == "direct" else blend(streams, decoded)

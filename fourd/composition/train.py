@@ -7,14 +7,14 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from fourd import metrics
-from fourd.composition import CompositionOptions, data, infer, losses
+from fourd.composition import CompositionOptions, data, losses
 from fourd.composition.checkpoint import Checkpoint, Progress, StopRequest
 from fourd.composition.model import CompositionNet, Discriminator, autocast
+from fourd.composition.validation import Report, compose_samples, is_stale, measure
 from fourd.errors import InputError
 
 log = logging.getLogger("fourd.composition")
@@ -147,28 +147,30 @@ def train(
     options: CompositionOptions,
     save: Checkpoint,
     stop: StopRequest,
+    report: Report | None = None,
 ) -> list[dict[str, Any]]:
-    """Train until the last epoch, `max_minutes` or a request to stop.
+    """Train until the last epoch, `patience` epochs without gain, `max_minutes` or a request to stop.
 
-    split: the samples to train on and those kept apart
+    split: the samples to train on and those kept apart;  report: called with every new row of the log
     Returns the rows of the log. Raises SystemExit after a signal, with everything saved.
     """
-    training, apart = split
+    training = split[0]
     counters = trainer.counters
     total = options.epochs * len(training)
     progress = Progress(total, counters["step"])
     started = time.monotonic() - counters["elapsed_s"]
+    log_epoch = functools.partial(_log_row, trainer, samples, split, options, report)
     if not counters["rows"] and counters["step"] == 0:
         # What the untrained network gives: without it nobody could tell what training added.
-        counters["rows"].append(_log_row(trainer, samples, apart, 0, options.precision))
-    while counters["step"] < total and not _is_over(options.max_minutes, started):
+        counters["rows"].append(log_epoch(0))
+    while counters["step"] < total and not _is_over(options, started, counters["rows"]):
         terms = train_step(trainer, samples, training, options)
         counters["elapsed_s"] = time.monotonic() - started
         step, epoch = counters["step"], (counters["step"] - 1) // len(training)
         if terms is not None:
             progress.report(step, epoch, options.epochs, terms)
         if counters["step"] % len(training) == 0:
-            counters["rows"].append(_log_row(trainer, samples, apart, epoch + 1, options.precision))
+            counters["rows"].append(log_epoch(epoch + 1))
             counters["sums"] = {}
             save(trainer)
         elif stop.signal_number is not None or save.is_due(options.checkpoint_s):
@@ -180,8 +182,7 @@ def train(
     unfinished = counters["step"] % len(training) != 0
     if not unfinished:
         return counters["rows"]
-    epoch = counters["step"] // len(training) + 1
-    return [*counters["rows"], _log_row(trainer, samples, apart, epoch, options.precision)]
+    return [*counters["rows"], log_epoch(counters["step"] // len(training) + 1)]
 
 
 def train_step(
@@ -201,7 +202,8 @@ def train_step(
     epoch, position = divmod(step, len(training))
     trainer.set_learning_rate(options.learning_rate * min(1.0, (step + 1) / max(options.warmup_steps, 1)))
     sample = training[data.sample_order(len(training), epoch, options.seed)[position]]
-    images = data.augment(samples.images(sample), options.crop, options.max_scale, options.seed, step)
+    scales = options.min_scale, options.max_scale
+    images = data.augment(samples.images(sample), options.crop, scales, options.seed, step)
     streams = data.streams_from_images(images, order).to(device)
     target, valid = (tensor.to(device) for tensor in data.target_from_images(images))
     result = update(trainer, streams, target, valid, options)
@@ -218,8 +220,13 @@ def train_step(
     return terms
 
 
-def _is_over(max_minutes: float | None, started: float) -> bool:
-    return max_minutes is not None and time.monotonic() - started >= 60 * max_minutes
+def _is_over(options: CompositionOptions, started: float, rows: Sequence[Mapping[str, Any]]) -> bool:
+    if options.max_minutes is not None and time.monotonic() - started >= 60 * options.max_minutes:
+        return True
+    if is_stale(rows, options.patience):
+        log.info("stopping: the frames kept apart have not improved for %d epochs", options.patience)
+        return True
+    return False
 
 
 def _count_skipped(counters: dict[str, Any], sample: data.SampleId) -> None:
@@ -243,31 +250,21 @@ def _psnr(output: Tensor, target: Tensor, valid: Tensor) -> float:
 
 
 def _log_row(
-    trainer: Trainer, samples: data.SampleSet, apart: Sequence[data.SampleId], epoch: int, precision: str
+    trainer: Trainer,
+    samples: data.SampleSet,
+    split: tuple[Sequence[data.SampleId], Sequence[data.SampleId]],
+    options: CompositionOptions,
+    report: Report | None,
+    epoch: int,
 ) -> dict[str, Any]:
     """A row of train.csv: means over the epoch, and quality at test-time inputs on samples kept apart."""
-    counters = trainer.counters
+    counters, (training, apart) = trainer.counters, split
     row = {name: total / count for name, (total, count) in counters["sums"].items()}
     row |= {"epoch": epoch, "step": counters["step"], "seconds": round(counters["elapsed_s"], 1)}
-    row |= {"skipped_steps": counters["skipped"]} | validate(trainer.network, samples, apart, precision)
-    return {name: row.get(name, "") for name in COLUMNS}
-
-
-def validate(
-    network: CompositionNet, samples: data.SampleSet, ids: Sequence[data.SampleId], precision: str
-) -> dict[str, float]:
-    """Mean PSNR, dB, of the network at test-time inputs and of the plain paste; empty without samples."""
-    rows = []
-    for sample in ids:
-        images = samples.images(sample)
-        truth, region = images[data.TARGET, ..., :3], images[data.TARGET, ..., 3] > 0
-        pair = (infer.run_network(network, images, precision), infer.paste_images(images))
-        if region.any():
-            rows.append([metrics.psnr(image, truth, region) for image in pair])
-    if not rows:
-        return {}
-    composed, pasted = np.mean(rows, axis=0)
-    log.info("test-time inputs, %d samples: %.2f dB, pasted %.2f dB", len(rows), composed, pasted)
-    if composed < pasted:
-        log.warning("the network is worse than pasting consensus over background: train longer")
-    return {"validation_psnr_db": float(composed), "paste_psnr_db": float(pasted)}
+    # Where nothing is kept apart there is still something to look at, but nothing to measure.
+    found = compose_samples(trainer.network, samples, apart or training[:1], options.precision)
+    row |= {"skipped_steps": counters["skipped"]} | (measure(found) if apart else {})
+    row = {name: row.get(name, "") for name in COLUMNS}
+    if report is not None:
+        report(row, found)
+    return row

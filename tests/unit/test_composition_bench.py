@@ -8,12 +8,21 @@ import numpy as np
 import pytest
 import torch
 
-from benches.composition import VARIANTS, Event, HeldOutFrame, average_views, draw_sheet, measure_variants
+from benches.composition import (
+    VARIANTS,
+    Event,
+    HeldOutFrame,
+    average_views,
+    compose_images,
+    draw_sheet,
+    measure_variants,
+    train_variant,
+)
 from fourd import io, metrics
 from fourd.composition import CompositionOptions, data
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = CompositionOptions(num_filters=(2,), depth=1, crop=16)
+SMALL = CompositionOptions(num_filters=(2, 2), depth=1, crop=16)
 
 
 @pytest.fixture(scope="module")
@@ -28,17 +37,18 @@ def event(tmp_path_factory):
         arrays |= {f"{key}_valid": np.ones((16, 24), bool) for key in keys}
         with io.ArchiveWriter(folder / f"{kind}.npz", {"view": "cam00"}) as writer:
             writer.add_frame(0, **arrays)
-    samples = data.SampleSet(
-        [folder / "foreground.npz"],
-        [folder / "background.npz"],
-        lambda cam, frame: (truth, np.ones((16, 24), bool)),
-        1,
-        8,
+    samples, coarse = (
+        data.SampleSet(
+            [folder / "foreground.npz"],
+            [folder / "background.npz"],
+            lambda cam, frame: (truth, np.ones((16, 24), bool)),
+            factor,
+            8,
+        )
+        for factor in (1, 2)
     )
-    dynamic = np.zeros((16, 24), bool)
-    return Event(
-        samples, {"held": [HeldOutFrame(samples.images(samples.ids[0]), np.ones((16, 24), bool), dynamic)]}
-    )
+    images, dynamic = samples.images(samples.ids[0]), np.zeros((16, 24), bool)
+    return Event(samples, coarse, {"held": [HeldOutFrame(images, np.ones((16, 24), bool), dynamic)]})
 
 
 def test_every_variant_is_of_options_that_exist():
@@ -66,3 +76,16 @@ def test_rows_say_what_a_variant_reaches_at_a_mark(event):
     assert draw_sheet({name: picture for (_, name), picture in pictures.items()}).shape[1] == 3 * 24 + 4
     means = average_views(rows[2:])
     assert means[0]["rms_error"] == pytest.approx(rows[2]["mse"] ** 0.5)
+
+
+def test_coarser_level_fills_what_the_finer_one_is_not_given(event):
+    """Both levels are trained in turns, and a hole that only the coarser one can fill is filled by it."""
+    images = event.samples.images(event.samples.ids[0]).copy()
+    options = dataclasses.replace(SMALL, precision="float32")
+    ((cost, networks),) = train_variant(event, VARIANTS["cascade"], options, [0.02])
+    assert len(networks) == 2 and cost["steps"] > 0
+    whole = compose_images(networks, images)
+    np.testing.assert_array_equal(whole, compose_images(networks[1:], images))
+    images[: data.TARGET, 4:10, 6:14] = 0
+    filled, alone = compose_images(networks, images), compose_images(networks[1:], images)
+    assert (filled != alone)[4:10, 6:14].any()

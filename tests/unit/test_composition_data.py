@@ -99,20 +99,20 @@ def test_streams_are_the_papers_in_training_and_consensus_and_background_at_test
 def test_augmentation_is_a_function_of_seed_and_step():
     images = np.random.default_rng(0).integers(0, 256, (7, 40, 60, 4)).astype(np.uint8)
     images[..., 3] = 255
-    first = data.augment(images, 16, 1.5, 3, 11)
+    first = data.augment(images, 16, (1.0, 1.5), 3, 11)
     assert first.shape == (7, 16, 16, 4)
-    assert np.array_equal(first, data.augment(images, 16, 1.5, 3, 11))
-    assert not np.array_equal(first, data.augment(images, 16, 1.5, 3, 12))
-    assert not np.array_equal(first, data.augment(images, 16, 1.5, 4, 11))
+    assert np.array_equal(first, data.augment(images, 16, (1.0, 1.5), 3, 11))
+    assert not np.array_equal(first, data.augment(images, 16, (1.0, 1.5), 3, 12))
+    assert not np.array_equal(first, data.augment(images, 16, (1.0, 1.5), 4, 11))
 
 
 def test_augmentation_without_enlargement_is_an_exact_crop_of_all_images():
     images = np.random.default_rng(0).integers(0, 256, (7, 20, 30, 4)).astype(np.uint8)
-    cropped = data.augment(images, 8, 1.0, 0, 5).astype(np.uint8)
+    cropped = data.augment(images, 8, (1.0, 1.0), 0, 5).astype(np.uint8)
     windows = np.lib.stride_tricks.sliding_window_view(images, (8, 8), axis=(1, 2))
     found = (windows == np.moveaxis(cropped, 3, 1)[:, None, None]).all(axis=(0, 3, 4, 5))
     assert found.sum() == 1
-    assert np.array_equal(data.augment(images, None, 1.0, 0, 5).astype(np.uint8), images)
+    assert np.array_equal(data.augment(images, None, (1.0, 1.0), 0, 5).astype(np.uint8), images)
 
 
 def test_augmentation_enlarges_a_ramp_by_at_most_the_factor():
@@ -120,18 +120,34 @@ def test_augmentation_enlarges_a_ramp_by_at_most_the_factor():
     ramp[..., 0], ramp[..., 3] = 2 * np.arange(96), 255
     slopes = []
     for step in range(20):
-        row = data.augment(ramp, 32, 1.5, 0, step)[0, 16, :, 0]
+        row = data.augment(ramp, 32, (1.0, 1.5), 0, step)[0, 16, :, 0]
         assert np.allclose(np.diff(row), np.diff(row)[0], atol=0.1)
         slopes.append(2 / np.diff(row).mean())
     assert 1.0 <= min(slopes) < 1.1
     assert 1.4 < max(slopes) <= 1.51
 
 
-def test_augmentation_never_mixes_blank_into_colour():
+@pytest.mark.parametrize("crop", [None, 32])
+def test_augmentation_reduces_a_ramp_to_no_less_than_the_factor(crop):
+    ramp = np.zeros((1, 64, 96, 4), np.uint8)
+    ramp[..., 0], ramp[..., 3] = 2 * np.arange(96), 255
+    slopes = []
+    for step in range(20):
+        out = data.augment(ramp, crop, (0.5, 1.0), 0, step)[0]
+        slopes.append(np.diff(out[out.shape[0] // 2, 1:-1, 0]).mean() / 2)
+        # As much of the picture as there is after it was reduced.
+        expected = [int(side / slopes[-1] + 0.1) for side in (64, 96)]
+        assert out.shape[:2] == (32, 32) if crop else np.allclose(out.shape[:2], expected, atol=1)
+    assert 1.0 <= min(slopes) < 1.1
+    assert 1.8 < max(slopes) <= 2.01
+
+
+@pytest.mark.parametrize("scales", [(1.0, 1.5), (0.5, 1.0)])
+def test_augmentation_never_mixes_blank_into_colour(scales):
     image = np.zeros((1, 32, 32, 4), np.uint8)
     image[:, :, :16] = [200, 100, 50, 255]
     for step in range(10):
-        out = data.augment(image, 24, 1.5, 0, step)[0]
+        out = data.augment(image, 24, scales, 0, step)[0]
         valid = out[..., 3] == 255
         assert np.allclose(out[valid], [200, 100, 50, 255], atol=1e-3)
         assert (out[~valid] == 0).all()

@@ -5,7 +5,7 @@ import resource
 import pytest
 import torch
 
-from fourd.composition.forecast import check_memory, count_saved_bytes, forecast_bytes
+from fourd.composition.forecast import count_saved_bytes, forecast_bytes, free_bytes, plan_memory
 from fourd.composition.model import CompositionNet
 from fourd.errors import InputError
 
@@ -40,10 +40,20 @@ def test_forecast_takes_no_memory_itself():
 
 
 def test_what_does_not_fit_is_refused_with_a_crop_that_does():
-    assert "GiB of memory" in check_memory(TINY, (64, 64), "float32", "cpu")
+    assert "GiB of memory" in plan_memory(TINY, (64, 64), "float32", "cpu")[1]
     with pytest.raises(
         InputError, match=r"needs about .* GiB, cpu has .*set composition crop to (\d+)"
     ) as error:
-        check_memory(TINY, (300000, 300000), "float32", "cpu")
+        plan_memory(TINY, (300000, 300000), "float32", "cpu")
     crop = int(str(error.value).split("crop to ")[1].split()[0])
-    assert "GiB of memory" in check_memory(TINY, (crop, crop), "float32", "cpu")
+    assert "GiB of memory" in plan_memory(TINY, (crop, crop), "float32", "cpu")[1]
+
+
+def test_activations_are_computed_twice_where_that_makes_a_step_fit():
+    """A step on a picture that needs a fifth more than there is."""
+    free = free_bytes("cpu")
+    per_pixel = forecast_bytes(TINY, (1024, 1024), "float32") / 1024**2
+    side = int((1.2 * free / per_pixel) ** 0.5) // 64 * 64
+    is_recomputed, line = plan_memory(TINY, (side, side), "float32", "cpu")
+    assert is_recomputed and "computed twice" in line
+    assert not plan_memory(TINY, (side // 2, side // 2), "float32", "cpu")[0]

@@ -155,3 +155,28 @@ def test_discriminator_gives_a_logit_per_patch():
 def test_unknown_head_is_refused():
     with pytest.raises(ValueError, match="blend"):
         CompositionNet(4, 1, 2, "softmax", 0)
+
+
+@pytest.mark.parametrize("head", model.HEADS)
+@pytest.mark.parametrize("precision", model.PRECISIONS)
+def test_activations_computed_twice_give_the_same_gradients_from_less_memory(head, precision):
+    torch.manual_seed(0)
+    network = CompositionNet(6, 1, 3, head, 0)
+    torch.nn.init.normal_(network.output[-1].weight, std=0.1)
+    streams, gradients, kept = random_streams(64, 64), [], []
+    for network.is_recomputed in (False, True):
+        network.zero_grad()
+        sizes = {}
+
+        def pack(tensor, sizes=sizes):
+            sizes[tensor.untyped_storage().data_ptr()] = tensor
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            loss = network(streams, precision).square().mean()
+        loss.backward()
+        gradients.append([p.grad.clone() for p in network.parameters()])
+        kept.append(sum(tensor.nbytes for tensor in sizes.values()))
+    assert all(map(torch.equal, *gradients))
+    assert any(float(gradient.abs().max()) > 0 for gradient in gradients[0])
+    assert kept[1] < 0.6 * kept[0]

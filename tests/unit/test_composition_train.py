@@ -49,7 +49,7 @@ def test_preset_of_the_paper_undoes_every_departure_from_it():
     assert (paper.head, paper.streams, paper.num_filters) == ("direct", "paper", (28, 23, 13))
     assert (paper.l1_weight, paper.adversarial_weight, paper.frequency_weight) == (100, 1, 100)
     assert (paper.learning_rate, paper.warmup_steps, paper.average_weights) == (2e-4, 0, False)
-    assert (paper.epochs, paper.crop) == (10, None)
+    assert (paper.epochs, paper.crop, paper.min_scale, paper.max_scale) == (10, None, 1, 1.5)
 
 
 def test_options_survive_the_command_line(sources, tmp_path):
@@ -236,7 +236,8 @@ def test_camera_without_video_is_named(sources, tmp_path):
     ("change", "sentence"),
     [
         ({"epochs": 0}, "epochs above 0"),
-        ({"max_scale": 0.5}, "max_scale of at least 1"),
+        ({"min_scale": 0.4}, "min_scale of at least 0.5"),
+        ({"min_scale": 1.2}, "at most max_scale, got 1.2 and 1.0"),
         ({"streams": "some"}, "streams to be one of all, paper"),
         ({"num_filters": ()}, "num_filters for level 0"),
         ({"head": "softmax"}, "head"),
