@@ -1,0 +1,242 @@
+"""A mark, carried to all cameras and all times.
+
+Within a frame the moving points of all cameras are gathered in voxels; from frame to frame each camera
+carries its mask along its own flow, and the voxels hold a vote. So a thing that one camera lost behind
+another is found again as soon as any camera has it. Outlines are settled per picture, by colour.
+"""
+
+import dataclasses
+import logging
+from collections.abc import Callable, Mapping, Sequence
+
+import cv2
+import numpy as np
+
+from fourd.camera import Camera
+from fourd.edit.colours import Colours, learn_colours
+from fourd.edit.moving import world_points
+from fourd.edit.outline import RIM_PX, refine_outline, widen
+from fourd.edit.plate import Window, plate_of
+from fourd.edit.voxels import (
+    MOVER,
+    OBJECT,
+    OTHER,
+    UNKNOWN,
+    MovingVoxels,
+    distances_to,
+    gather_voxels,
+    settle_labels,
+    vote_labels,
+)
+
+log = logging.getLogger(__name__)
+# Side of a voxel in pixels of the picture that was marked, at the depth of the mark.
+VOXEL_PX = 3.0
+# Flow there and back that ends farther away is not believed, px.
+_FLOW_MISS_PX = 1.5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Instant:
+    """One frame of the scene, as ideal pinholes see it.
+
+    cameras, images, depths: camera -> Camera, (H, W, 3) uint8, (H, W) float32 z
+    moving, untold: camera -> (H, W) bool, see `find_moving`
+    still: camera -> what it films at other times, see `plate_of`
+    """
+
+    cameras: Mapping[str, Camera]
+    images: Mapping[str, np.ndarray]
+    depths: Mapping[str, np.ndarray]
+    moving: Mapping[str, np.ndarray]
+    untold: Mapping[str, np.ndarray]
+    still: Mapping[str, Sequence[tuple[Camera, np.ndarray, np.ndarray]]]
+
+    def plate_finder(self, name: str, points: np.ndarray) -> Callable[[Window], tuple[np.ndarray, ...]]:
+        """What finds the plate behind the points, (N, 3), in a window of a camera's picture."""
+        camera = self.cameras[name]
+        z = camera.project(points)[1] if len(points) else np.ones(1)
+        nearest = max(float(z.min()), 1e-3 * float(np.abs(z).max()))
+        return lambda window: plate_of(camera, window, (nearest, 100 * nearest), self.still[name])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Found:
+    """The marked thing at one frame.
+
+    masks: camera -> (H, W) bool
+    kinds: camera -> (H, W) uint8 OBJECT, OTHER of what else moves, UNKNOWN elsewhere
+    points: (N, 3) voxel centres of the thing;  others: (M, 3) of what else moves
+    still: (K, 3) places near the thing that stand still
+    """
+
+    masks: dict[str, np.ndarray]
+    kinds: dict[str, np.ndarray]
+    points: np.ndarray
+    others: np.ndarray
+    still: np.ndarray
+
+    def joined(self, other: "Found") -> "Found":
+        """Both things as one."""
+        masks = {name: mask | other.masks[name] for name, mask in self.masks.items()}
+        kinds = {
+            name: np.where(other.kinds[name] == OBJECT, OBJECT, kind) for name, kind in self.kinds.items()
+        }
+        rest = self.others[~np.isfinite(distances_to(self.others, other.points, 1e-9))]
+        points, still = (
+            np.concatenate(pair) for pair in ((self.points, other.points), (self.still, other.still))
+        )
+        return Found(masks, kinds, points, rest, still)
+
+
+def voxels_of(instant: Instant, side: float) -> MovingVoxels:
+    """Moving pixels of all cameras in voxels."""
+    points = {}
+    for name, camera in instant.cameras.items():
+        depth = np.where(instant.moving[name], instant.depths[name], np.nan)
+        points[name] = world_points(camera, depth)
+    return gather_voxels(points, {name: d.shape for name, d in instant.depths.items()}, side)
+
+
+def carry_flow(image: np.ndarray, before: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The mask of a neighbouring frame along the flow.
+
+    image, before: (H, W, 3) uint8 of this and of the neighbouring frame;  mask: (H, W) uint8 of that frame
+    Returns (H, W) uint8 OBJECT, OTHER, or UNKNOWN where the flow there and back does not close.
+    Source: T. Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016.
+    """
+    back, forth = dense_flow(image, before), dense_flow(before, image)
+    height, width = mask.shape
+    x = np.arange(width, dtype=np.float32) + back[..., 0]
+    y = np.arange(height, dtype=np.float32)[:, None] + back[..., 1]
+    returned = cv2.remap(
+        forth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e6, 1e6)
+    )
+    miss = np.linalg.norm(back + returned, axis=-1)
+    carried = cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN)
+    return np.where(miss <= _FLOW_MISS_PX, carried, UNKNOWN).astype(np.uint8)
+
+
+def dense_flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(H, W, 2) float32 flow, px, of two (H, W, 3) uint8 pictures."""
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    method.setFinestScale(1)
+    grays = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (first, second)]
+    return np.asarray(method.calc(grays[0], grays[1], None))  # type: ignore[call-overload]
+
+
+def find_frame(
+    instant: Instant,
+    side: float,
+    hints: Mapping[str, np.ndarray],
+    before: tuple[np.ndarray, np.ndarray] | None = None,
+    colours: Colours | None = None,
+) -> Found:
+    """The thing at one frame, from what each camera believes of it.
+
+    hints: camera -> (H, W) uint8 OBJECT, OTHER or UNKNOWN
+    before: points of the thing and of what else moves in the neighbouring frame;  colours: of the thing
+    """
+    voxels = voxels_of(instant, side)
+    beliefs = None if colours is None else {n: colours.of(image) for n, image in instant.images.items()}
+    labels = settle_labels(voxels, vote_labels(voxels, hints, before, beliefs))
+    points, others = voxels.centers[labels == OBJECT], voxels.centers[labels == OTHER]
+    still = _still_nearby(instant, points, side)
+    masks, kinds = {}, {}
+    for name, image in instant.images.items():
+        at, depth = voxels.index[name], instant.depths[name]
+        kind = np.where(np.isfinite(depth) & ~instant.untold[name], OTHER, UNKNOWN).astype(np.uint8)
+        kind[at >= 0] = labels[at[at >= 0]]
+        is_mover = (at >= 0) & (kind == OTHER)
+        kind[is_mover] = MOVER
+        ours = splat_points(instant.cameras[name], points, side)
+        theirs = splat_points(instant.cameras[name], others, side)
+        masks[name] = refine_outline(image, kind, ours < theirs, instant.plate_finder(name, points))
+        is_mover &= ~widen(masks[name], RIM_PX)
+        kinds[name] = np.where(masks[name], OBJECT, np.where(is_mover, OTHER, UNKNOWN)).astype(np.uint8)
+    return Found(masks, kinds, points, others, still)
+
+
+def find_rest(instant: Instant, found: Found, side: float) -> Found:
+    """All else that moves at the frame of a thing."""
+    masks = {}
+    for name, image in instant.images.items():
+        theirs = found.kinds[name]
+        kind = np.where(np.isfinite(instant.depths[name]) & ~instant.untold[name], OTHER, UNKNOWN)
+        kind = np.where(theirs == OTHER, OBJECT, np.where(theirs == OBJECT, MOVER, kind)).astype(np.uint8)
+        rest = splat_points(instant.cameras[name], found.others, side)
+        thing = splat_points(instant.cameras[name], found.points, side)
+        plates = instant.plate_finder(name, found.others)
+        masks[name] = refine_outline(image, kind, rest < thing, plates) & ~found.masks[name]
+    still = _still_nearby(instant, found.others, side)
+    return Found(masks, found.kinds, found.others, found.points, still)
+
+
+def _still_nearby(instant: Instant, points: np.ndarray, side: float) -> np.ndarray:
+    """(K, 3) centres of voxels around the thing's that stand still."""
+    near = {}
+    for name, camera in instant.cameras.items():
+        is_still = ~instant.moving[name] & ~instant.untold[name]
+        places, index = world_points(camera, np.where(is_still, instant.depths[name], np.nan))
+        if len(points):
+            low, high = points.min(axis=0) - 4 * side, points.max(axis=0) + 4 * side
+            around = ((places >= low) & (places <= high)).all(axis=1)
+            places, index = places[around], index[around]
+            close = np.isfinite(distances_to(places, points, 4 * side))
+            near[name] = places[close], index[close]
+    shapes = {name: depth.shape for name, depth in instant.depths.items()}
+    return gather_voxels(near, shapes, side).centers
+
+
+def splat_points(camera: Camera, points: np.ndarray, side: float) -> np.ndarray:
+    """(H, W) float32 z of the nearest point, each as wide as a voxel; infinite where there is none."""
+    width, height = camera.size
+    image = np.full((height, width), np.inf, np.float32)
+    if not len(points):
+        return image
+    pixels, z = camera.project(points)
+    front = z > 0
+    pixels, z = np.rint(pixels[front]).astype(np.int64), z[front].astype(np.float32)
+    if not len(z):
+        return image
+    radius = int(np.clip(np.ceil(0.6 * side * camera.focal_px / np.median(z)), 1, 8))
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            x, y = pixels[:, 0] + dx, pixels[:, 1] + dy
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            np.minimum.at(image, (y[inside], x[inside]), z[inside])
+    return image
+
+
+def carry_mark(
+    hints: Mapping[str, np.ndarray],
+    frame: int,
+    frames: Sequence[int],
+    load: Callable[[int], Instant],
+    side: float,
+    carry: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None,
+) -> dict[int, Found]:
+    """The thing at all frames, from hints at one of them, forth and back in time.
+
+    frames: rising, with `frame` among them;  load: gives the instant of a frame;  side: of a voxel
+    carry: takes masks from frame to frame, as `carry_flow` does
+    """
+    carry = carry or carry_flow
+    found = {frame: find_frame(load(frame), side, hints)}
+    kinds = found[frame].kinds
+    colours = learn_colours(
+        load(frame).images, {name: (kind == OBJECT, kind == OTHER) for name, kind in kinds.items()}
+    )
+    start = list(frames).index(frame)
+    for order in (frames[start + 1 :], frames[:start][::-1]):
+        before, at = load(frame), frame
+        for now in order:
+            instant = load(now)
+            carried = {
+                name: carry(image, before.images[name], found[at].kinds[name])
+                for name, image in instant.images.items()
+            }
+            found[now] = find_frame(instant, side, carried, (found[at].points, found[at].others), colours)
+            before, at = instant, now
+            log.info("frame %d: %d voxels", now, len(found[now].points))
+    return found

@@ -1,0 +1,156 @@
+"""Moving points of all cameras at one instant, gathered in voxels, and which of them are the marked thing.
+
+A voxel belongs to the thing because most of the pixels that look at it do: no camera decides alone. What
+no mask reaches goes with the nearest voxel along the surface.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.sparse import csr_matrix, diags
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import KDTree
+
+OBJECT, OTHER, UNKNOWN = 1, 0, 2
+# In a picture: something else that moves, where OTHER stands still.
+MOVER = 3
+# Voxels whose centres are nearer than this many sides touch: holes of a voxel or so are bridged.
+_REACH = 2.0
+# Pixels of a voxel that is more than noise.
+_MIN_PIXELS = 3
+# Rounds in which voxels go with the majority around them.
+_ROUNDS = 3
+# Votes of a colour that only the thing has, or only others have.
+_COLOUR_VOTES = 2.0
+_BITS = 20
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MovingVoxels:
+    """What moves at one instant.
+
+    side: of a voxel, world units;  centers: (V, 3) float64 mean of the points inside
+    counts: (V,) pixels of all cameras in each;  index: camera -> (H, W) int32 voxel of a moving pixel, or -1
+    """
+
+    side: float
+    centers: np.ndarray
+    counts: np.ndarray
+    index: Mapping[str, np.ndarray]
+
+
+def gather_voxels(
+    points: Mapping[str, tuple[np.ndarray, np.ndarray]], shapes: Mapping[str, tuple[int, int]], side: float
+) -> MovingVoxels:
+    """Voxels of moving pixels; those of very few are noise, and left out.
+
+    points: camera -> (N, 3) world points and (N,) flat pixels;  shapes: camera -> (H, W)
+    """
+    names = list(points)
+    stacked = np.concatenate([points[name][0] for name in names]) if names else np.zeros((0, 3))
+    cells = np.floor(stacked / side).astype(np.int64) + (1 << (_BITS - 1))
+    keys = (cells[:, 0] << 2 * _BITS) | (cells[:, 1] << _BITS) | cells[:, 2]
+    _, voxel, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    sums = [np.bincount(voxel, stacked[:, axis], minlength=len(counts)) for axis in range(3)]
+    centers = np.stack(sums, axis=-1) / np.maximum(counts, 1)[:, None]
+    kept = counts >= _MIN_PIXELS
+    number = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
+    index, first = {}, 0
+    for name in names:
+        pixels = points[name][1]
+        image = np.full(shapes[name], -1, np.int32)
+        image.ravel()[pixels] = number[voxel[first : first + len(pixels)]]
+        index[name] = image
+        first += len(pixels)
+    return MovingVoxels(side, centers[kept], counts[kept], index)
+
+
+def vote_labels(
+    voxels: MovingVoxels,
+    masks: Mapping[str, np.ndarray],
+    before: tuple[np.ndarray, np.ndarray] | None = None,
+    beliefs: Mapping[str, np.ndarray] | None = None,
+) -> np.ndarray:
+    """(V,) uint8 label of every voxel by the majority of the pixels that look at it.
+
+    masks: camera -> (H, W) uint8 OBJECT, OTHER or UNKNOWN; a camera that is not named knows nothing
+    before: (N, 3) points of the thing and (M, 3) of others in the neighbouring frame; the nearer has a vote
+    beliefs: camera -> (H, W) float32 in -1..1, how much a pixel's colour is the thing's; together one vote
+    Each camera has one vote per voxel, however many of its pixels lie there.
+    """
+    num = len(voxels.centers)
+    balance = np.zeros(num)
+    for name, mask in masks.items():
+        at = voxels.index[name]
+        told = (at >= 0) & (mask != UNKNOWN)
+        opinion = np.where(mask[told] == OBJECT, 1.0, -1.0)
+        total = np.bincount(at[told], opinion, minlength=num)
+        counts = np.bincount(at[told], minlength=num)
+        balance += np.divide(total, counts, out=np.zeros(num), where=counts > 0)
+    if before is not None:
+        ours, theirs = (distances_to(voxels.centers, points, _REACH * voxels.side) for points in before)
+        balance += (ours < theirs).astype(float) - (theirs < ours)
+    if beliefs is not None:
+        total, counts = np.zeros(num), np.zeros(num)
+        for name, belief in beliefs.items():
+            at = voxels.index[name]
+            total += np.bincount(at[at >= 0], belief[at >= 0], minlength=num)
+            counts += np.bincount(at[at >= 0], minlength=num)
+        # What nothing else is known about goes with the surface that it is on.
+        voted = (counts > 0) & (balance != 0)
+        balance += _COLOUR_VOTES * np.divide(total, counts, out=np.zeros(num), where=voted)
+    return np.where(balance > 0, OBJECT, np.where(balance < 0, OTHER, UNKNOWN)).astype(np.uint8)
+
+
+def find_parts(voxels: MovingVoxels, chosen: np.ndarray | None = None) -> np.ndarray:
+    """(V,) int32 connected part of every voxel; those not chosen, (V,) bool, are parts by themselves."""
+    graph = _graph(voxels)
+    if chosen is not None:
+        keep = diags(chosen.astype(float))
+        graph = keep @ graph @ keep
+    return connected_components(graph, directed=False)[1].astype(np.int32)
+
+
+def distances_to(points: np.ndarray, targets: np.ndarray, most: float) -> np.ndarray:
+    """(N,) distance of every point to the nearest target, infinite beyond `most`."""
+    if not len(targets) or not len(points):
+        return np.full(len(points), np.inf)
+    return KDTree(targets).query(points, distance_upper_bound=most)[0]
+
+
+def _graph(voxels: MovingVoxels) -> csr_matrix:
+    """(V, V) distances of voxels that touch, both ways."""
+    num = len(voxels.centers)
+    pairs = KDTree(voxels.centers).query_pairs(_REACH * voxels.side, output_type="ndarray")
+    lengths = np.linalg.norm(voxels.centers[pairs[:, 0]] - voxels.centers[pairs[:, 1]], axis=1)
+    # A length of exactly 0 would be no edge.
+    lengths = np.maximum(lengths, 1e-6 * voxels.side)
+    half = csr_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(num, num))
+    return half + half.T
+
+
+def settle_labels(voxels: MovingVoxels, labels: np.ndarray) -> np.ndarray:
+    """(V,) uint8 OBJECT or OTHER for every voxel.
+
+    labels: (V,) uint8, of which some are UNKNOWN
+    Voxels go with the majority of those around them, a few times; unknown ones then take the label that is
+    nearest along the surface. A part without any label is something else.
+    """
+    graph = _graph(voxels)
+    # A surface fills its voxels, noise is spread over many.
+    own = 2 * np.sqrt(voxels.counts)
+    touching = graph.copy()
+    touching.data[:] = 1
+    touching = touching @ diags(own / 2)
+    sign = np.where(labels == OBJECT, 1.0, np.where(labels == OTHER, -1.0, 0.0)).astype(np.float32)
+    for _ in range(_ROUNDS):
+        sign = np.sign(touching @ sign + own * sign)
+    distances = []
+    for wanted in (1, -1):
+        seeds = np.flatnonzero(sign == wanted)
+        if len(seeds):
+            distances.append(dijkstra(graph, directed=False, indices=seeds, min_only=True))
+        else:
+            distances.append(np.full(len(labels), np.inf))
+    return np.where(distances[0] < distances[1], OBJECT, OTHER).astype(np.uint8)
