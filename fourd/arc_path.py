@@ -30,13 +30,13 @@ class ArcPath:
     """
 
     def __init__(self, tracks: Sequence[CameraTrack], up: np.ndarray) -> None:
-        cameras = [_average_track(track) for track in tracks]
-        up = _checked_up(np.asarray(up, dtype=np.float64))
+        cameras = [average_track(track) for track in tracks]
+        up = checked_up(np.asarray(up, dtype=np.float64))
         _check_places(cameras)
         centers = np.stack([camera.center for camera in cameras])
         forward = np.stack([camera.forward for camera in cameras])
         image_up = np.stack([-camera.R[1] for camera in cameras])
-        point = _common_point(cameras, tracks)
+        point = common_point(cameras, tracks)
         if point is None:
             self._chart: _PolarChart | _FlatChart = _FlatChart(
                 forward.mean(axis=0), image_up.mean(axis=0), up
@@ -137,7 +137,7 @@ class _FlatChart:
         return coordinates @ self._basis
 
 
-def _average_track(track: CameraTrack) -> Camera:
+def average_track(track: CameraTrack) -> Camera:
     """The camera at its mean place, rotation and focal length over the clip."""
     R = Rotation.from_matrix(np.stack([camera.R for camera in track.cameras])).mean().as_matrix()
     center = np.mean([camera.center for camera in track.cameras], axis=0)
@@ -156,7 +156,8 @@ def _min_angle_to(up: np.ndarray, directions: np.ndarray) -> float:
     return float(np.minimum(angles, 180 - angles).min())
 
 
-def _checked_up(up: np.ndarray) -> np.ndarray:
+def checked_up(up: np.ndarray) -> np.ndarray:
+    """The direction (3,) at length 1. Raises InputError if it is none."""
     length = float(np.linalg.norm(up))
     if up.shape != (3,) or not np.isfinite(length) or length == 0:
         raise InputError(
@@ -179,7 +180,7 @@ def _check_places(cameras: Sequence[Camera]) -> None:
         )
 
 
-def _common_point(cameras: Sequence[Camera], tracks: Sequence[CameraTrack]) -> np.ndarray | None:
+def common_point(cameras: Sequence[Camera], tracks: Sequence[CameraTrack]) -> np.ndarray | None:
     """The point that the cameras look at, or None where they look in parallel or apart."""
     point = convergence_point(cameras)
     offsets = np.stack([point - camera.center for camera in cameras])

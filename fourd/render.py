@@ -1,7 +1,7 @@
 """Stage `render`: frames of a view through the trained generators, and a film of them.
 
 `frames` reads the estimates of one view and chunk and writes a folder of `000012.png` and
-`holes.csv`; `video` joins such folders into an MP4. Section 4.1 of the paper.
+`holes.csv`; `video` joins such folders into a film. Section 4.1 of the paper.
 """
 
 import argparse
@@ -25,6 +25,8 @@ from fourd.views import read_view
 STAGE_VERSION = 3
 HOLES_COLUMNS = ("frame", "level", "hole_share", "largest_hole_share", "filled_share", "reason")
 PROGRESS_INTERVAL_S = 2.0
+# As in `fourd.video.encode`, which need not be loaded to render.
+CODEC_NAMES = ("h264", "hevc", "av1", "prores", "ffv1")
 
 logger = logging.getLogger(__name__)
 ItemT = TypeVar("ItemT")
@@ -154,13 +156,37 @@ def list_frames(folders: Sequence[Path]) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def run_video(folders: Sequence[Path], fps: float, output: Path) -> None:
+def run_video(
+    folders: Sequence[Path],
+    fps: float,
+    output: Path,
+    codec: str = "h264",
+    right_folders: Sequence[Path] = (),
+) -> None:
     """Encode the frames of all folders, which must follow on each other without a gap.
 
-    Raises InputError if there is none, or one is missing between the first and the last.
+    right_folders: of the right eye, whose frames are put to the right of the others'
+    Raises InputError if there is none, one is missing between the first and the last, or the eyes have
+    different frames.
     """
     from fourd.video import encode_video
 
+    left, right = _frames_in_a_row(folders), _frames_in_a_row(right_folders) if right_folders else {}
+    if right and right.keys() != left.keys():
+        raise InputError(
+            f"expected both eyes to have the same frames, got {len(left)} and {len(right)} in "
+            f"{', '.join(map(str, [*folders, *right_folders]))}: render both"
+        )
+
+    def picture(frame: int) -> np.ndarray:
+        image = read_image(left[frame])
+        return np.hstack([image, read_image(right[frame])]) if right else image
+
+    frames = with_progress(list(left), output.name)
+    encode_video(output, (picture(frame) for frame in frames), fps, codec)
+
+
+def _frames_in_a_row(folders: Sequence[Path]) -> dict[int, Path]:
     found = list_frames(folders)
     if not found:
         raise InputError(
@@ -172,7 +198,7 @@ def run_video(folders: Sequence[Path], fps: float, output: Path) -> None:
             f"expected every frame from {min(found)} to {max(found)}, but frame {missing[0]} is missing in "
             f"{', '.join(map(str, folders))}: render it first"
         )
-    encode_video(output, (read_image(path) for path in with_progress(list(found.values()), output.name)), fps)
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -187,15 +213,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     frames.add_argument("--frames", type=int, nargs="+", required=True, help="output frames")
     frames.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ...")
     frames.add_argument("--threads", type=int, default=1)
-    video = commands.add_parser("video", help="join rendered frames into an MP4")
+    cli.add_options(frames, RenderOptions)
+    video = commands.add_parser("video", help="join rendered frames into a film")
     video.add_argument("--frames-dir", type=Path, nargs="+", required=True)
-    video.add_argument("--fps", type=float, required=True)
+    video.add_argument("--right-frames-dir", type=Path, nargs="*", default=[], help="of the right eye")
+    video.add_argument("--fps", type=float, required=True, help="frames per second")
+    video.add_argument("--codec", default="h264", choices=CODEC_NAMES)
     for command in (frames, video):
-        cli.add_options(command, RenderOptions)
         command.add_argument("--output", type=Path, required=True)
     args = parser.parse_args(argv)
     if args.command == "video":
-        run_video(args.frames_dir, args.fps, args.output)
+        run_video(args.frames_dir, args.fps, args.output, args.codec, args.right_frames_dir)
         return
     cli.set_num_threads(args.threads)
     options = cli.options_from_args(RenderOptions, args)

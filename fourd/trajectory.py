@@ -1,18 +1,22 @@
-"""Paths of a virtual camera through the places where people filmed, and the time that they show.
+"""Films: the path of a virtual camera among the places where people filmed, and the time that it shows.
 
-A trajectory has two independent halves: where the view is (`kind`), and which frame of the event
-is shown (`time`). The path runs through the input cameras' mean places, so the shake of hand-held
-cameras does not enter; the picture stays level and looks where the neighbouring cameras look.
+A trajectory has two independent halves: where the view is (`kind` and its keys), and which frame of
+the event is shown (`time`). Paths run through the input cameras' mean places, so the shake of
+hand-held cameras does not enter. The keys are told in docs/paths.md.
 """
 
 import dataclasses
+import hashlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
+import yaml
 
 from fourd.camera import Camera
 from fourd.errors import InputError
+from fourd.paths.checks import check_keys, check_numbers, check_points
+from fourd.paths.timing import check_time, frames_of_keys
 
 if TYPE_CHECKING:
     from fourd.sfm.cameras import SceneCameras
@@ -22,6 +26,9 @@ DEFAULT_TRAJECTORIES: dict[str, dict[str, Any]] = {
     "hold_view": {"kind": "hold", "time": "running"},
     "time_and_view": {"kind": "arc", "time": "running"},
 }
+KINDS = ("arc", "hold", "orbit", "dolly", "bullet_time", "follow", "cameras", "keys")
+EYES = ("middle", "left", "right")
+RIGHT_EYE = "_right"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,54 +38,121 @@ class TrajectorySpec:
     kind: `arc` moves from `path_from` to `path_to`, `hold` stays at `position`; all three are
     shares of the path's length, 0 the leftmost camera, 1 the rightmost (lowest and highest, or
     farthest and nearest, where the cameras stand so). `position` None is halfway between the two
-    middle cameras.
-    time: `running` shows the whole clip once, `frozen` only `time_frame` (None: the middle one)
-    num_frames: of the film; None is the clip's number
+    middle cameras. The other kinds are described in `fourd.paths.presets`.
+    time: `running` shows the whole clip once, `frozen` only `time_frame` (None: the middle one); see
+    `fourd.paths.timing` for the others and for keys
+    num_frames: of the film; None is the clip's number, twice that of a bullet time
     ease: the view starts and stops smoothly
+    file: a path file that says all the rest
     """
 
     kind: str = "arc"
     path_from: float = 0.1
     path_to: float = 0.9
     position: float | None = None
-    time: str = "running"
+    turn_deg: float | None = None
+    closer: float = 0.3
+    keep_size: bool = False
+    cameras: tuple[str, ...] = ()
+    keys: tuple[Mapping[str, Any], ...] = ()
+    look_at: tuple[Any, ...] | None = None
+    fov_deg: float | None = None
+    world: str = "scene"
+    time: str | tuple[Mapping[str, Any], ...] = "running"
     time_frame: int | None = None
     num_frames: int | None = None
     ease: bool = True
+    size: tuple[int, int] | None = None
+    stereo: float | None = None
+    eye: str = "middle"
+    file: str | None = None
+
+
+def read_path_file(path: Path | str) -> dict[str, Any]:
+    """A path file, JSON or YAML (docs/paths.md). Raises InputError if it is missing or no mapping."""
+    source = Path(path)
+    if not source.is_file():
+        raise InputError(f"expected a path file at {source}, found nothing: check the name")
+    try:
+        # JSON is YAML, but for tabs, which no writer of ours uses.
+        document = yaml.safe_load(source.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"expected JSON or YAML in {source}, got: {' '.join(str(error).split())}") from None
+    if not isinstance(document, dict) or "file" in document:
+        raise InputError(f"expected the keys of a path in {source} (without `file`): see docs/paths.md")
+    document.pop("schema_version", None)
+    return document
+
+
+def resolve_trajectories(trajectories: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Trajectories as jobs need them: path files with a digest of their content, stereo films as two views.
+
+    A film `NAME` with `stereo` stays as the left eye's; the right eye's is added as `NAME_right`.
+    Raises InputError for an unusable trajectory or path file, or a name that is taken.
+    """
+    resolved: dict[str, dict[str, Any]] = {}
+    for name, given in trajectories.items():
+        spec = trajectory_from_mapping(given, f"trajectory {name}")
+        document = dict(given)
+        if spec.file:
+            digest = hashlib.sha256(Path(spec.file).read_bytes()).hexdigest()[:16]
+            document = {"file": spec.file, "digest": digest, "size": spec.size, "stereo": spec.stereo}
+        if spec.stereo is None or spec.eye != "middle":
+            resolved[name] = document
+            continue
+        if name + RIGHT_EYE in trajectories:
+            raise InputError(
+                f"trajectory {name} is stereo, and its right eye would be {name}{RIGHT_EYE}, which exists: "
+                "rename one"
+            )
+        resolved[name] = {**document, "eye": "left"}
+        resolved[name + RIGHT_EYE] = {**document, "eye": "right"}
+    return resolved
 
 
 def trajectory_from_mapping(document: Mapping[str, Any], where: str) -> TrajectorySpec:
-    """Spec from its JSON form, checked.
+    """Spec from its JSON form, checked; a path file that it names is read.
 
     where: name of the trajectory for the error message
     Raises InputError for unknown keys, wrong values or keys that contradict each other.
     """
+    document = {key: value for key, value in document.items() if key != "digest"}
+    if document.get("file"):
+        eye = document.get("eye", "middle")
+        where = f"{where}, {document['file']}"
+        document = {**read_path_file(document["file"]), "file": document["file"]}
+        if eye != "middle":
+            document["eye"] = eye
     known = {field.name for field in dataclasses.fields(TrajectorySpec)}
     unknown = sorted(set(document) - known)
     if unknown:
         raise InputError(f"{where}: unknown key {unknown[0]!r}; known keys are {', '.join(sorted(known))}")
-    spec = TrajectorySpec(**document)
-    allowed = {"kind": ("arc", "hold"), "time": ("running", "frozen")}
-    for key, values in allowed.items():
-        if getattr(spec, key) not in values:
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in document.items()}
+    spec = TrajectorySpec(**values)
+    allowed = {"kind": KINDS, "eye": EYES, "world": ("scene", "source")}
+    for key, words in allowed.items():
+        if getattr(spec, key) not in words:
             raise InputError(
-                f"{where}: {key} is {getattr(spec, key)!r}, expected one of {', '.join(values)}: fix it"
+                f"{where}: {key} is {getattr(spec, key)!r}, expected one of {', '.join(words)}: fix it"
             )
-    for key in ("path_from", "path_to", "position"):
-        value = getattr(spec, key)
-        if value is None and key == "position":
-            continue
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
-            raise InputError(f"{where}: {key} is {value!r}, expected a share of the path from 0 to 1: fix it")
-    for key, least in (("time_frame", 0), ("num_frames", 1)):
-        value = getattr(spec, key)
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
-            raise InputError(
-                f"{where}: {key} is {value!r}, expected null or a whole number from {least}: fix it"
-            )
-    if not isinstance(spec.ease, bool):
-        raise InputError(f"{where}: ease is {spec.ease!r}, expected true or false: fix it")
+    check_numbers(spec, where)
+    check_time(spec.time, where)
+    check_points(spec.look_at, where)
+    check_keys(spec, where)
     return spec
+
+
+def film_length(spec: TrajectorySpec, num_frames: int) -> int:
+    """Frames of the film. num_frames: of the clip."""
+    if spec.num_frames is not None:
+        return spec.num_frames
+    return 2 * num_frames if spec.kind == "bullet_time" else num_frames
+
+
+def bullet_moment(spec: TrajectorySpec, num_frames: int) -> tuple[int, float]:
+    """The frame at which a bullet time stands still, and the share of the film at which it stops."""
+    frame = num_frames // 2 if spec.time_frame is None else spec.time_frame
+    return frame, 0.5 * frame / (num_frames - 1) if num_frames > 1 else 0.25
 
 
 def scene_frames(spec: TrajectorySpec | Mapping[str, Any], num_frames: int) -> list[int]:
@@ -86,43 +160,44 @@ def scene_frames(spec: TrajectorySpec | Mapping[str, Any], num_frames: int) -> l
 
     spec: or its JSON form;  num_frames: of the clip
     No camera is needed, so the films' jobs are known before any job runs.
-    Raises InputError when the frozen frame lies outside the clip.
+    Raises InputError when a frame lies outside the clip.
     """
     if isinstance(spec, Mapping):
         spec = trajectory_from_mapping(spec, "trajectory")
-    length = num_frames if spec.num_frames is None else spec.num_frames
+    length, last = film_length(spec, num_frames), num_frames - 1
+    if spec.time_frame is not None and spec.time_frame > last:
+        raise InputError(
+            f"trajectory: time_frame is {spec.time_frame}, expected 0..{last}, the frames of the clip: "
+            "choose an earlier one"
+        )
+    if not isinstance(spec.time, str):
+        return frames_of_keys(spec.time, length, num_frames, "trajectory")
+    if spec.kind == "bullet_time":
+        frame, stop = bullet_moment(spec, num_frames)
+        ends = [{"at": 0, "frame": 0}, {"at": 1, "frame": last}]
+        still = [{"at": stop, "frame": frame}, {"at": stop + 0.5, "frame": frame}]
+        return frames_of_keys([ends[0], *still, ends[1]], length, num_frames, "trajectory")
     if spec.time == "frozen":
-        frame = num_frames // 2 if spec.time_frame is None else spec.time_frame
-        if frame >= num_frames:
-            raise InputError(
-                f"trajectory: time_frame is {frame}, expected 0..{num_frames - 1}, the frames of the clip: "
-                "choose an earlier one"
-            )
-        return [frame] * length
+        return [num_frames // 2 if spec.time_frame is None else spec.time_frame] * length
     if length == 1:
         return [num_frames // 2]
     # Integer rounding: the same list on every machine.
-    return [(2 * i * (num_frames - 1) + length - 1) // (2 * (length - 1)) for i in range(length)]
+    if spec.time == "there_and_back":
+        end = length - 1
+        return [(4 * last * min(i, end - i) + end) // (2 * end) for i in range(length)]
+    frames = [(2 * i * last + length - 1) // (2 * (length - 1)) for i in range(length)]
+    return frames[::-1] if spec.time == "reversed" else frames
 
 
 def place_cameras(spec: TrajectorySpec, scene_cameras: "SceneCameras", size: tuple[int, int]) -> list[Camera]:
     """The ideal pinhole of every frame of the film.
 
-    size: of the film, (width, height) px; pixels are square, the principal point is central and
-    the field of view over the diagonal is interpolated from the neighbouring cameras'
-    Raises InputError when there are fewer than two input cameras or all stand in one place.
+    size: of the film, (width, height) px; pixels are square, the principal point is central (but for
+    the eyes of a stereo film) and, unless stated, the field of view over the diagonal is interpolated
+    from the neighbouring cameras'
+    Raises InputError when the cameras or the keys do not make the path.
     """
     # SciPy takes 0.3 s to import, and the workflow's every start needs `scene_frames` only.
-    from fourd.arc_path import ArcPath
+    from fourd.paths.presets import place_film
 
-    tracks = [scene_cameras.tracks[name] for name in scene_cameras.inputs]
-    path = ArcPath(tracks, scene_cameras.up)
-    length = len(scene_frames(spec, scene_cameras.num_frames))
-    if spec.kind == "hold":
-        position = path.middle_share() if spec.position is None else spec.position
-        return [path.camera_at(position, size)] * length
-    run = np.linspace(0.0, 1.0, length) if length > 1 else np.array([0.5])
-    if spec.ease:
-        run = run * run * (3 - 2 * run)
-    shares = spec.path_from + (spec.path_to - spec.path_from) * run
-    return [path.camera_at(float(share), size) for share in shares]
+    return place_film(spec, scene_cameras, scene_frames(spec, scene_cameras.num_frames), size)

@@ -1,4 +1,4 @@
-"""Films: generators applied frame by frame, then one video per trajectory."""
+"""Films: generators applied frame by frame, then one video per trajectory and where it was filmed from."""
 
 
 rule render_frames:
@@ -31,14 +31,12 @@ rule render_frames:
 
 rule encode_film:
     input:
-        lambda wildcards: expand(
-            "<results>/{scene}/render/{view}/{chunk}",
-            scene=wildcards.scene,
-            view=wildcards.trajectory,
-            chunk=chunks_of_view(wildcards.trajectory),
-        ),
+        unpack(folders_of_film),
+        view="<results>/{scene}/views/{trajectory}.json",
+        cameras="<results>/{scene}/sfm/cameras.json",
     output:
-        "<results>/{scene}/render/{trajectory}.mp4",
+        film="<results>/{scene}/render/{trajectory}.mp4",
+        path="<results>/{scene}/render/{trajectory}.json",
     log:
         "<logs>/{scene}/encode_film/{trajectory}.log",
     benchmark:
@@ -47,9 +45,40 @@ rule encode_film:
         "../envs/torch.yaml"
     threads: 1
     params:
-        fps=SCENE.fps,
-        options=options("render"),
+        options=film_flags(config["film"]["codec"]),
         version=fourd_config.stage_version("render"),
     shell:
-        "python -m fourd.render video --frames-dir {input} --fps {params.fps} {params.options}"
-        " --output {output} 2> {log}"
+        "(python -m fourd.render video --frames-dir {input.frames} --right-frames-dir {input.right}"
+        " {params.options} --output {output.film}"
+        " && python -m fourd.paths describe --view-file {input.view} --cameras {input.cameras}"
+        " --output {output.path}) 2> {log}"
+
+
+# A second film that loses nothing, or little, to cut and to grade.
+rule encode_master:
+    input:
+        unpack(folders_of_film),
+    output:
+        "<results>/{scene}/render/{trajectory}.{suffix}",
+    log:
+        "<logs>/{scene}/encode_master/{trajectory}.{suffix}.log",
+    benchmark:
+        "<benchmarks>/{scene}/encode_master/{trajectory}.{suffix}.tsv"
+    wildcard_constraints:
+        suffix="mov|mkv",
+    conda:
+        "../envs/torch.yaml"
+    threads: 1
+    params:
+        options=lambda wildcards: film_flags({"mov": "prores", "mkv": "ffv1"}[wildcards.suffix]),
+        version=fourd_config.stage_version("render"),
+    shell:
+        "python -m fourd.render video --frames-dir {input.frames} --right-frames-dir {input.right}"
+        " {params.options} --output {output} 2> {log}"
+
+
+if config["film"]["master"] != "none":
+    FILMS += [
+        film.replace(".mp4", {"prores": ".mov", "ffv1": ".mkv"}[config["film"]["master"]])
+        for film in list(FILMS)
+    ]

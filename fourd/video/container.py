@@ -12,6 +12,12 @@ from av.stream import Disposition
 
 from fourd.errors import InputError
 
+# Films come from strangers. A playlist or a list of files is no film: it would read, or ask a network for,
+# what the scene does not name. Frames larger than this would fill the memory from a file of some kilobytes.
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,mxf,asf,flv,ogg,gif"
+CONTAINERS += ",yuv4mpegpipe,h264,hevc,av1,ivf,mjpeg,wav,mp3,flac,aac,aiff"
+MAX_FRAME_PIXELS = 2**27
+
 
 @contextlib.contextmanager
 def explained(path: Path | str) -> Iterator[None]:
@@ -31,10 +37,13 @@ def open_container(path: Path | str) -> InputContainer:
         raise InputError(f"expected a video file at {path}, found nothing: check the path in the scene file")
     if Path(path).stat().st_size == 0:
         raise InputError(f"expected a video file at {path}, got an empty file: copy it again")
-    container = av.open(str(path))
+    # Without `file:` a name with a colon is taken for an address.
+    limits = {"protocol_whitelist": "file", "format_whitelist": CONTAINERS}
+    container = av.open(f"file:{path}", options=limits)
     for stream in (*container.streams.video, *container.streams.audio):
         if stream.codec_context is not None:
             stream.codec_context.thread_count = 1
+            stream.codec_context.options = {"max_pixels": str(MAX_FRAME_PIXELS)}
     return container
 
 
@@ -56,6 +65,11 @@ def video_stream(container: InputContainer, path: Path | str) -> av.VideoStream:
         raise InputError(
             f"expected a video at {path}, got a file without pictures that can be decoded: it is no video, "
             "truncated or in an unknown codec; copy it again or convert it to H.264"
+        )
+    if stream.width * stream.height > MAX_FRAME_PIXELS:
+        raise InputError(
+            f"expected a video of at most {MAX_FRAME_PIXELS} px a frame at {path}, got {stream.width} x "
+            f"{stream.height}: make it smaller"
         )
     return stream
 
