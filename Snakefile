@@ -19,8 +19,12 @@ include: "rules/fuse.smk"
 include: "rules/background.smk"
 include: "rules/composition.smk"
 include: "rules/render.smk"
+include: "rules/edit.smk"
 include: "rules/evaluate.smk"
+include: "rules/plan.smk"
 include: "rules/report.smk"
+include: "rules/viewer.smk"
+include: "rules/export.smk"
 include: "rules/bench.smk"
 include: "rules/ablations.smk"
 
@@ -31,6 +35,11 @@ rule render_all:
         FILMS,
         EVALUATION,
     localrule: True
+
+
+onstart:
+    check_folders()
+    check_budget(rule.name for rule in workflow.dag.targetrules)
 
 
 onsuccess:

@@ -27,8 +27,12 @@ def load_yaml(path: Path | str) -> dict[str, Any]:
     if not source.is_file():
         raise InputError(f"expected a file at {source}, found nothing: check the name")
     try:
-        document = yaml.safe_load(source.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        text = source.read_text(encoding="utf-8")
+        # A few nested aliases stand for more entries than there is memory.
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise yaml.YAMLError("an alias (*NAME), write the part out")
+        document = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError(f"expected YAML in {source}, got: {' '.join(str(error).split())}") from None
     if not isinstance(document, dict):
         raise InputError(f"expected a mapping of keys in {source}, got {type(document).__name__}")
@@ -40,7 +44,7 @@ def load_config_schema(folder: Path = SCHEMA_FOLDER) -> dict[str, Any]:
     schema = load_yaml(folder / "config.schema.yaml")
     for path in sorted(folder.glob("*.schema.yaml")):
         section = path.name.removesuffix(".schema.yaml")
-        if section not in ("config", "scene"):
+        if section not in ("config", "scene", "edit_file"):
             schema["properties"][section] = load_yaml(path)
     return schema
 
@@ -360,26 +364,6 @@ def kept_intermediates(
         if total <= config["keep_gb"] * 1e9:
             kept.add(name)
     return frozenset(kept)
-
-
-def check_sources(scene: Scene, made_by_rules: tuple[str, ...]) -> None:
-    """Raise InputError for the first source or calibration file that is not there.
-
-    made_by_rules: beginnings of paths that the workflow itself makes
-    """
-    named = {f"camera {name}": camera.source for name, camera in scene.cameras.items()}
-    named |= {
-        f"background of camera {name}": camera.background
-        for name, camera in scene.cameras.items()
-        if camera.background
-    }
-    named |= {f"calibration file {i + 1}": path for i, path in enumerate(scene.calibration)}
-    for what, path in named.items():
-        if not path.startswith(made_by_rules) and not Path(path).exists():
-            raise InputError(
-                f"scene {scene.name}, {what}: expected a file or folder at {path}, found nothing: "
-                f"correct the path in config/scenes/{scene.name}.yaml (paths start at {Path.cwd()})"
-            )
 
 
 def view_frames(scene: Scene, config: Mapping[str, Any]) -> dict[str, dict[int, int]]:

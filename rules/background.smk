@@ -7,6 +7,7 @@ rule estimate_background:
         cameras="<results>/{scene}/sfm/cameras.json",
         films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=sample_disparities,
+        survey=ancient("<results>/{scene}/plan/survey.json"),
     output:
         intermediate("foreground", "<results>/{scene}/background/{view}/{chunk}.npz"),
     log:

@@ -74,7 +74,9 @@ if SCENE.name == "demo_known":
             cameras=f"{RESULTS}/sfm/cameras.json",
             films=expand(f"{RESULTS}/frames/cameras/{{cam}}.npz", cam=SCENE.cameras),
             views=expand(f"{RESULTS}/views/{{cam}}.json", cam=SCENE.heldout),
-            disparity=expand(f"{RESULTS}/disparity/{{pair}}/samples.npz", pair=SCENE.pairs),
+            disparity=lambda wildcards: expand(
+                f"{RESULTS}/disparity/{{pair}}/samples.npz", pair=pairs_without("")
+            ),
         output:
             "<results>/bench/background/background_error.csv",
         log:

@@ -1,6 +1,8 @@
 """Checked configuration, the lists that span the job graph, and helper functions of the rules."""
 
+import functools
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -11,21 +13,55 @@ sys.path.insert(0, workflow.basedir)
 from fourd import config as fourd_config
 from fourd.cli import flags_from_mapping
 from fourd.errors import InputError
+from fourd.plan.budget import describe_budget, fixed_keys, reduce_config
+from fourd.plan.files import read_survey
+from fourd.plan.options import options_from_section
+from fourd.plan.outline import describe_scene
+from fourd.plan.work import OK, choose_work
+from fourd.sources import check_sources, source_stamp
+from fourd.trajectory import resolve_trajectories
+
+MADE_BY_RULES = ("data/demo/", "data/pose2sim/")
+
+# Numbers that a person has given are not lowered by a budget.
+FIXED_KEYS = fixed_keys(config)
 
 try:
     SCENE, _scene_settings = fourd_config.load_scene(config.get("scene", "demo"))
     config = fourd_config.load_config(config, _scene_settings, SCENE.name)
+    config["trajectories"] = resolve_trajectories(config["trajectories"])
     CHUNK_FRAMES = fourd_config.fit_chunk_frames(config, SCENE)
     # What rules make or fetch need not be there yet.
-    fourd_config.check_sources(SCENE, made_by_rules=("data/demo/", "data/pose2sim/"))
+    check_sources(SCENE, made_by_rules=MADE_BY_RULES)
     # Output frame -> scene frame, for every place that is filmed from.
     VIEW_FRAMES = fourd_config.view_frames(SCENE, config)
     KEPT = fourd_config.kept_intermediates(SCENE, config, VIEW_FRAMES)
+    # For its checks: the engine takes an error in an input function for a file that nothing makes.
+    choose_work(None, SCENE.pairs, options_from_section(config["plan"]))
 except InputError as error:
     raise WorkflowError(str(error)) from None
 
 # Where results lie, for flags that name files: pathvars are filled in for inputs and outputs only.
 RESULTS = f"{config['pathvars'].get('results', 'results')}/{SCENE.name}"
+ASKED, ASKED_KEPT = config, KEPT
+
+
+def within_budget():
+    """The configuration within its budget, and what that took: None without one, or before it is planned."""
+    survey = Path(RESULTS) / "plan" / "survey.json"
+    machine = Path(RESULTS).parent / "machine" / "speed.json"
+    try:
+        outline = describe_scene(SCENE, ASKED, VIEW_FRAMES, ASKED_KEPT)
+        return reduce_config(ASKED, outline, survey, machine, FIXED_KEYS)
+    except InputError as error:
+        raise WorkflowError(str(error)) from None
+
+
+HAS_BUDGET = ASKED["minutes"] is not None or ASKED["disk_gb"] is not None
+REDUCTION = None
+if HAS_BUDGET:
+    config, REDUCTION = within_budget()
+    KEPT = frozenset(REDUCTION.kept) if REDUCTION else KEPT
 TRAJECTORIES = config["trajectories"]
 CHUNKS = fourd_config.chunk_names(SCENE.num_frames, CHUNK_FRAMES)
 LEVELS = range(fourd_config.num_levels(SCENE, config))
@@ -50,9 +86,53 @@ def scene_chunks(view, chunk):
     return sorted({CHUNKS[f // CHUNK_FRAMES] for f in frames})
 
 
+def work_to_do():
+    """What is made and what is left out; all that might be needed while the cameras are not known."""
+    is_run = workflow.executor_plugin is not None and not workflow.dryrun
+    path = Path(RESULTS) / "plan" / "survey.json"
+    if is_run:
+        path = checkpoints.survey.get(scene=SCENE.name).output[0]
+    return read_work(str(path), Path(path).stat().st_mtime_ns if Path(path).is_file() else None)
+
+
+def check_budget(targets):
+    """Refuse a run whose budget cannot be kept yet. targets: names of the rules that are asked for."""
+    if HAS_BUDGET and REDUCTION is None and set(targets) != {"plan"}:
+        raise WorkflowError(
+            "a budget (minutes, disk_gb) can be kept once the cameras and the speed of this machine are known: "
+            "run the target `plan` with the same budget first, nothing that it makes is made again"
+        )
+
+
+@functools.cache
+def read_work(path, changed_ns):
+    """What is made according to a survey of the scene, None if there is none yet."""
+    if changed_ns is None:
+        print(
+            "The cameras are not known yet: this is an upper bound with every pair of cameras. Pairs that "
+            "cannot be matched will be left out (`snakemake --cores 2 plan` finds out which).",
+            file=sys.stderr,
+        )
+    try:
+        survey = None if changed_ns is None else read_survey(path)
+        return choose_work(survey, SCENE.pairs, options_from_section(config["plan"]))
+    except InputError as error:
+        raise WorkflowError(str(error)) from None
+
+
+def plan_flags():
+    """Within the budget as it is once the survey is there, which may be later than the start of this run."""
+    settings, reduction = within_budget()
+    kept = reduction.kept if reduction else KEPT
+    outline = describe_scene(SCENE, settings, VIEW_FRAMES, kept)
+    flags = {"outline": outline, "budget": describe_budget(ASKED, reduction)}
+    words = {flag: json.dumps(value, sort_keys=True) for flag, value in flags.items()}
+    return flags_from_mapping(words | settings["plan"])
+
+
 def pairs_without(view):
-    """Pairs that may serve a view: a camera never helps to predict itself."""
-    return [p for p in SCENE.pairs if view not in p.split("-")]
+    """Pairs that serve a view: a camera never helps to predict itself."""
+    return [p for p in work_to_do().matched if view not in p.split("-")]
 
 
 def options(section):
@@ -77,6 +157,7 @@ def view_flags(wildcards):
     flags = {"size": SCENE.size}
     if wildcards.view in TRAJECTORIES:
         flags["trajectory"] = json.dumps(TRAJECTORIES[wildcards.view], sort_keys=True)
+        flags["size"] = TRAJECTORIES[wildcards.view].get("size") or SCENE.size
     else:
         flags["frames"] = sorted(VIEW_FRAMES[wildcards.view])
     return flags_from_mapping(flags)
@@ -119,21 +200,32 @@ def disparity_frames(wildcards):
     return list(fourd_config.frames_of_chunk(wildcards.chunk))
 
 
-def disparities_of_view(wildcards):
+def disparities_at(view, chunks):
+    """Disparities that the foreground of a view is made from, none where nothing moves."""
     return expand(
         "<results>/{scene}/disparity/{pair}/{chunk}.npz",
-        scene=wildcards.scene,
-        pair=pairs_without(wildcards.view),
-        chunk=scene_chunks(wildcards.view, wildcards.chunk),
+        scene=SCENE.name,
+        pair=pairs_without(view) if work_to_do().foreground == OK else [],
+        chunk=chunks,
     )
+
+
+def silhouettes_at(chunks):
+    work = work_to_do()
+    is_made = work.foreground == OK and work.silhouettes == OK
+    return expand(
+        "<results>/{scene}/silhouettes/{chunk}.npz",
+        scene=SCENE.name,
+        chunk=chunks if is_made else [],
+    )
+
+
+def disparities_of_view(wildcards):
+    return disparities_at(wildcards.view, scene_chunks(wildcards.view, wildcards.chunk))
 
 
 def silhouettes_of_view(wildcards):
-    return expand(
-        "<results>/{scene}/silhouettes/{chunk}.npz",
-        scene=wildcards.scene,
-        chunk=scene_chunks(wildcards.view, wildcards.chunk),
-    )
+    return silhouettes_at(scene_chunks(wildcards.view, wildcards.chunk))
 
 
 def empty_scene_of(wildcards):
@@ -203,6 +295,32 @@ def label_flags(wildcards):
     return "".join(flags_from_mapping({"labels": path}) for path in labels_of(wildcards))
 
 
+def folders_of_film(wildcards):
+    """Rendered frames of a film, and of its right eye where it is stereo."""
+    name = wildcards.trajectory
+    is_stereo = TRAJECTORIES[name].get("eye") == "left" and f"{name}_right" in TRAJECTORIES
+    views = {"frames": [name], "right": [f"{name}_right"] if is_stereo else []}
+    folder = "<results>/{scene}/render/{view}/{chunk}"
+    return {
+        key: [
+            path
+            for view in names
+            for path in expand(folder, scene=wildcards.scene, view=view, chunk=chunks_of_view(view))
+        ]
+        for key, names in views.items()
+    }
+
+
+def film_flags(codec):
+    return flags_from_mapping({"fps": config["film"]["fps"] or SCENE.fps, "codec": codec})
+
+
+def chunks_shown(frames, chunk):
+    """Chunks of the scene's clock that a chunk of output frames shows. frames: scene frame of each of these."""
+    shown = [frames[i] for i in fourd_config.frames_of_chunk(chunk)]
+    return sorted({CHUNKS[frame // CHUNK_FRAMES] for frame in shown})
+
+
 FILMS = expand(
     "<results>/{scene}/render/{trajectory}.mp4", scene=SCENE.name, trajectory=TRAJECTORIES
 )
@@ -217,6 +335,20 @@ EVALUATION = (
 )
 
 
+def check_folders():
+    """Stop before the first job if one of the folders cannot be written."""
+    for kind in ("results", "logs", "benchmarks"):
+        folder = Path(config["pathvars"].get(kind, kind)).absolute()
+        there = next(
+            path for path in (folder / SCENE.name, folder, *folder.parents) if path.exists()
+        )
+        if not os.access(there, os.W_OK):
+            raise WorkflowError(
+                f"expected a folder for {kind} that can be written, got {there}: give the right to write "
+                f"there, or another folder with --config 'pathvars={{{kind}: FOLDER}}'"
+            )
+
+
 def print_finished():
     """Where to look, and what was left out, when everything is done."""
     # Imported here: it loads OpenCV, which a dry run does not need.
@@ -227,6 +359,8 @@ def print_finished():
     films = [p for p in (folder / "render" / f"{name}.mp4" for name in TRAJECTORIES) if p.is_file()]
     if films:
         print(f"\nFilms of {SCENE.name}:", *(f"  {film}" for film in films), sep="\n")
+    if (folder / "viewer" / "index.html").is_file():
+        print(f"\nTo browse: {folder / 'viewer' / 'index.html'}")
     cameras = folder / "sfm" / "cameras.json"
     left_out = read_json(cameras)["left_out"] if cameras.is_file() else {}
     if left_out:

@@ -8,8 +8,9 @@ rule fuse_training:
         view=expand("<results>/{{scene}}/views/{cam}.json", cam=SCENE.inputs),
         cameras="<results>/{scene}/sfm/cameras.json",
         films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
-        disparity=expand("<results>/{{scene}}/disparity/{pair}/{{chunk}}.npz", pair=SCENE.pairs),
-        silhouettes="<results>/{scene}/silhouettes/{chunk}.npz",
+        disparity=lambda wildcards: disparities_at("", wildcards.chunk),
+        silhouettes=lambda wildcards: silhouettes_at(wildcards.chunk),
+        survey=ancient("<results>/{scene}/plan/survey.json"),
     output:
         [
             intermediate("foreground", f"<results>/{{scene}}/foreground/{cam}/{{chunk}}.npz")
@@ -40,6 +41,7 @@ rule fuse_foreground:
         films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=disparities_of_view,
         silhouettes=silhouettes_of_view,
+        survey=ancient("<results>/{scene}/plan/survey.json"),
     output:
         intermediate("foreground", "<results>/{scene}/foreground/{view}/{chunk}.npz"),
     log:

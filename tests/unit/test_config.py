@@ -33,6 +33,9 @@ OPTIONS = {
     "render": "fourd.render.RenderOptions",
     "evaluate": "fourd.evaluate.EvaluateOptions",
     "report": "fourd.report.ReportOptions",
+    "edit": "fourd.edit.options.EditOptions",
+    "export": "fourd.export.ExportOptions",
+    "viewer": "fourd.viewer.ViewerOptions",
 }
 
 
