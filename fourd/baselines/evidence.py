@@ -44,6 +44,7 @@ class Evidence:
     films:      features of all input cameras over the whole event
     query:      feature of the truth
     others:     frames that other programs rendered, by the name of the method
+    humans:     folder of the networks and the body of SfM+humans, empty without
     """
 
     foreground: Mapping[str, np.ndarray]
@@ -56,6 +57,7 @@ class Evidence:
     films: FilmIndex
     query: np.ndarray
     others: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    humans: str = ""
 
     @functools.cached_property
     def depth(self) -> np.ndarray:

@@ -6,7 +6,7 @@ sheet. Nothing that makes a render reads what this stage writes, or a held-out c
 
 import dataclasses
 
-STAGE_VERSION = 2
+STAGE_VERSION = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +19,8 @@ class EvaluateOptions:
     neighbour_frames: int = 30
     lpips_weights: str = ""
     lpips_net: str = "alex"
+    inception: str = ""
+    humans: str = ""
     other: tuple[str, ...] = ()
     sheet_frames: int = 3
     sheet_tile_px: int = 288

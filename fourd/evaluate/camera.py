@@ -12,7 +12,7 @@ from fourd.evaluate import EvaluateOptions
 from fourd.evaluate.contact_sheet import SheetRow, amplified_error, draw_sheet
 from fourd.evaluate.evidence import EvidenceReader, Sources
 from fourd.evaluate.regions import surface_regions
-from fourd.evaluate.score import Frame, Scorer, score_image
+from fourd.evaluate.score import ALL_FRAMES, Frame, Scorer, score_image, score_masks
 from fourd.image import label_image
 from fourd.io import write_csv, write_png
 from fourd.render import with_progress
@@ -31,8 +31,9 @@ COLUMNS = (
     "note",
 )
 NEIGHBOURS = ("nn_same_time", "nn_all_times")
+BODIES = "bodies of MakeHuman by landmarks of BlazePose, over SfM densified"
 # Regions that the workflow's own estimates define, whatever the truth is.
-OWN_REGIONS = ("seen_1", "seen_2", "inferred")
+OWN_REGIONS = ("seen_1", "seen_2", "inferred", "outside_hull")
 
 
 __all__ = ["COLUMNS", "EvidenceReader", "Sources", "run_camera", "score_image"]
@@ -90,17 +91,19 @@ def _score_frames(
     methods = list_methods(list(reader.others))
     order = list(methods)
     scorer = Scorer(options)
-    remarks: dict[str, str] = dict.fromkeys(NEIGHBOURS, reader.films.name)
+    remarks = {**dict.fromkeys(NEIGHBOURS, reader.films.name), "sfm_humans": BODIES}
     rows: list[dict[str, Any]] = []
     sheet: list[SheetRow] = []
     for entry in with_progress(entries, f"evaluate {reader.view.name}"):
         evidence, valid = reader.read(entry)
-        moves = reader.find_moves(entry, evidence, options) & valid
+        found, true = reader.find_moves(entry, evidence), reader.read_moves(entry)
+        moves = (found if true is None else true) & valid
         images, reasons = run_methods(evidence, valid, methods)
         regions = {"full": valid, "dynamic": moves}
         regions |= {name: region & valid for name, region in surface_regions(evidence).items()}
         scores = scorer.score(Frame(images, evidence.truth, valid, moves), regions, reasons, remarks)
         scores.sort(key=lambda score: order.index(score["method"]))
+        scores += [] if true is None else score_masks(found & valid, moves)
         rows += [
             {
                 "view": reader.view.name,
@@ -113,6 +116,13 @@ def _score_frames(
         ]
         if entry.frame in shown:
             sheet.append(_sheet_row(reader.view.name, entry.frame, images, evidence.truth, scores, options))
+    of_all = {
+        "view": reader.view.name,
+        "frame": ALL_FRAMES,
+        "dt_s": "",
+        "region_source": reader.region_source,
+    }
+    rows += [{**of_all, **score} for score in scorer.score_sets()]
     return rows, sheet
 
 

@@ -25,6 +25,8 @@ from fourd.views import View, ViewFrame, physical_view, read_view
 FOREGROUND_KEYS = ("consensus_rgb", "consensus_valid", "depth", "num_cameras")
 BACKGROUND_KEYS = ("farthest_rgb", "farthest_valid", "depth", "filled")
 STILL_FRAMES = 15
+# Columns of the contact sheet and rows of the table that are no methods.
+RESERVED_NAMES = ("truth", "error", "masks")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,19 +109,24 @@ class EvidenceReader:
             self.films,
             self._describe(truth),
             {name: read_image(files[frame]) for name, files in self.others.items()},
+            self._options.humans,
         ), valid
 
-    def find_moves(self, entry: ViewFrame, evidence: Evidence, options: EvaluateOptions) -> np.ndarray:
-        """(H, W) bool, where something moves: from the true masks if there are any."""
-        if self._labels is not None:
-            camera = self._scene.tracks[self.view.name].at(entry.scene_frame)
-            shown = self._readers[self.view.name].source_frame(entry.scene_frame)
-            return read_dynamic_mask(self._labels, shown, camera, entry.camera)
+    def read_moves(self, entry: ViewFrame) -> np.ndarray | None:
+        """(H, W) bool, where something moves by the true masks; None without them."""
+        if self._labels is None:
+            return None
+        camera = self._scene.tracks[self.view.name].at(entry.scene_frame)
+        shown = self._readers[self.view.name].source_frame(entry.scene_frame)
+        return read_dynamic_mask(self._labels, shown, camera, entry.camera)
+
+    def find_moves(self, entry: ViewFrame, evidence: Evidence) -> np.ndarray:
+        """(H, W) bool, where something moves by what no still picture explains."""
         background = evidence.background
         pictures = [(background["farthest_rgb"], background["farthest_valid"])]
         if self._still is not None:
             pictures.append(self._still.seen_from(entry.camera))
-        return find_dynamic_pixels(evidence.truth, pictures, options)
+        return find_dynamic_pixels(evidence.truth, pictures, self._options)
 
     @property
     def region_source(self) -> str:
@@ -131,9 +138,9 @@ class EvidenceReader:
         return self._readers[self.view.name].dt_s(entry.scene_frame)
 
     def _make_still_picture(self) -> StillPicture | None:
-        """None where there are true masks, or too few frames for a median to leave out what moves."""
+        """None where there are too few frames for a median to leave out what moves."""
         frames = spread_frames(self._scene.num_frames, STILL_FRAMES)
-        if self._labels is not None or len(frames) < 3:
+        if len(frames) < 3:
             return None
         name = self.view.name
         return StillPicture([(self._readers[name].read(f), self._scene.tracks[name].at(f)) for f in frames])
@@ -190,10 +197,10 @@ def _list_others(words: tuple[str, ...], view: View) -> dict[str, dict[int, Path
     others: dict[str, dict[int, Path]] = {}
     for word in words:
         name, _, folder = word.partition("=")
-        if not name or not folder or name in METHODS or name in others:
+        if not name or not folder or name in (*METHODS, *RESERVED_NAMES, *others):
             raise InputError(
                 f"evaluate other: expected NAME=FOLDER with a new name, got {word!r}; names in use are "
-                f"{', '.join([*METHODS, *others])}"
+                f"{', '.join([*METHODS, *RESERVED_NAMES, *others])}"
             )
         files = list_frames([Path(folder) / view.name])
         for entry in view.frames:

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.optimize import nnls
 
 from fourd.baselines import Evidence
+from fourd.baselines.warp import FARTHEST
 from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.evaluate import EvaluateOptions
@@ -19,6 +21,10 @@ from fourd.image import undistort
 from fourd.io import read_image
 
 STRIP_ROWS = 64
+# How far a view may look from outside the inputs' cone and still count as between them: cameras that
+# stand in one plane, as people hold them, span a flat cone.
+HULL_TOLERANCE_DEG = 5.0
+HULL_STEP_PX = 16
 
 
 def read_dynamic_mask(folder: Path, frame: int, camera: Camera, target: Camera) -> np.ndarray:
@@ -69,7 +75,7 @@ def _moved(camera: Camera, to: Camera) -> Camera:
 
 
 def surface_regions(evidence: Evidence) -> dict[str, np.ndarray]:
-    """(H, W) bool: `seen_1`, `seen_2` and `inferred`.
+    """(H, W) bool: `seen_1`, `seen_2`, `inferred` and `outside_hull` (see `find_outside_hull`).
 
     seen_N: pixels whose surface, by the depth of the consensus or else of the background, lies in
     the pictures of N inputs and is not hidden there by another surface of the view, or was agreed
@@ -84,7 +90,50 @@ def surface_regions(evidence: Evidence) -> dict[str, np.ndarray]:
         "seen_1": num_seen >= 1,
         "seen_2": num_seen >= 2,
         "inferred": ~near & (~far | evidence.background["filled"]),
+        "outside_hull": find_outside_hull(
+            evidence.depth, evidence.camera, [entry.camera.center for entry in evidence.inputs.values()]
+        ),
     }
+
+
+def find_outside_hull(depth: np.ndarray, camera: Camera, centers: Sequence[np.ndarray]) -> np.ndarray:
+    """(H, W) bool: where a view looks at a surface from a direction that lies between no inputs.
+
+    depth: (H, W) z in `camera`, world units, NaN = none;  centers: (3,) of the inputs, world units
+    From the surface point, the direction to the view must lie more than 5 degrees outside the convex
+    cone of the directions to all inputs, whether they see the point or not. Where there is no depth
+    nothing can be said, so the pixel is not outside. Decided on a grid of 16 px: directions turn slowly.
+    """
+    if not centers:
+        return ~np.isnan(depth)
+    rows, columns = (np.arange(HULL_STEP_PX // 2, side, HULL_STEP_PX) for side in depth.shape)
+    height, width = depth.shape
+    grid = np.ix_(rows if len(rows) else [height // 2], columns if len(columns) else [width // 2])
+    z = np.minimum(depth[grid].astype(np.float64), FARTHEST)
+    y, x = np.broadcast_arrays(*grid)
+    points = camera.unproject(np.stack([x, y], axis=-1).astype(np.float64), z)
+    outside = np.zeros(z.shape, bool)
+    for index in zip(*np.nonzero(~np.isnan(z)), strict=True):
+        to_view, *to_inputs = (_unit(center - points[index]) for center in (camera.center, *centers))
+        # The residual is the sine of the angle to the cone while that is below 90 degrees, else 1.
+        outside[index] = nnls(np.stack(to_inputs, axis=1), to_view)[1] > np.sin(
+            np.radians(HULL_TOLERANCE_DEG)
+        )
+    spread = np.repeat(np.repeat(outside, HULL_STEP_PX, axis=0), HULL_STEP_PX, axis=1)
+    spread = np.pad(spread, ((0, HULL_STEP_PX), (0, HULL_STEP_PX)), mode="edge")[:height, :width]
+    return spread & ~np.isnan(depth)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+def compare_masks(found: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """Intersection over union, precision and recall of (H, W) bool masks; NaN for a division by 0."""
+    both = int((found & true).sum())
+    totals = {"mask_iou": found | true, "mask_precision": found, "mask_recall": true}
+    counts = {name: int(total.sum()) for name, total in totals.items()}
+    return {name: both / count if count else float("nan") for name, count in counts.items()}
 
 
 def find_dynamic_pixels(

@@ -9,10 +9,20 @@ import numpy as np
 
 from fourd import metrics
 from fourd.evaluate import EvaluateOptions
+from fourd.evaluate.regions import compare_masks
+from fourd.metrics_distribution import frechet_distance, kernel_distance
+from fourd.metrics_fid import load_inception
 from fourd.metrics_lpips import load_network, missing_weights
 
+# By the first word of the metric.
+SET_METRICS = {"frechet": frechet_distance, "kernel": kernel_distance, "fid": frechet_distance}
+# No methods may have these names: the true pictures, and rows of the workflow's own masks.
+TRUTH = "truth"
+MASKS = "masks"
 # Where a method is expected to have a value in every frame.
 HEADLINE = ("full", "psnr_db")
+# The frame of values that are of all frames of a camera together.
+ALL_FRAMES = "all"
 TOO_SMALL = f"a side is under {metrics.MS_SSIM_MIN_SIDE_PX} px"
 
 
@@ -70,16 +80,29 @@ def score_flicker(method: str, frame: Frame, earlier: Frame) -> Iterator[tuple[s
         yield name, "flicker", float(change[region].mean(dtype=np.float64)) if count else math.nan, count
 
 
+def score_masks(found: np.ndarray, true: np.ndarray) -> list[dict[str, Any]]:
+    """Rows of the workflow's own masks of what moves against true ones, both (H, W) bool."""
+    rows = []
+    for metric, value in compare_masks(found, true).items():
+        row = _row(MASKS, "dynamic", metric, value, int(true.sum()))
+        rows.append({**row, "note": "" if row["value"] else "nothing is marked"})
+    return rows
+
+
 class Scorer:
     """Scores the frames of one camera in their order."""
 
     def __init__(self, options: EvaluateOptions) -> None:
-        self._lpips_metric = f"lpips_{options.lpips_net}"
+        self._net = options.lpips_net
+        self._lpips_metric = f"lpips_{self._net}"
         self._no_lpips = missing_weights(options.lpips_weights, options.lpips_net)
         self._network = (
             load_network(options.lpips_weights, options.lpips_net) if self._no_lpips is None else None
         )
         self._earlier: Frame | None = None
+        self._inception = load_inception(options.inception) if options.inception else None
+        # Metric of sets -> method -> feature of each picture.
+        self._features: dict[str, dict[str, list[np.ndarray]]] = {}
 
     def score(
         self,
@@ -94,15 +117,14 @@ class Scorer:
         remarks: method -> what to know about its image
         """
         rows = []
-        features = None if self._network is None else self._network.features(frame.truth)
+        features = self._look(TRUTH, frame.truth)
         for method, image in frame.images.items():
             values = list(score_image(image, frame.truth, regions))
             if self._earlier is not None and method in self._earlier.images:
                 values += score_flicker(method, frame, self._earlier)
             num_pixels = int(regions["full"].sum())
-            distance = math.nan
-            if self._network is not None and features is not None:
-                distance = self._network.distance(self._network.features(image), features)
+            own = self._look(method, image)
+            distance = math.nan if self._network is None else self._network.distance(own, features)
             values.append(("full", self._lpips_metric, distance, num_pixels))
             for region, metric, value, count in values:
                 rows.append(_row(method, region, metric, value, count))
@@ -111,6 +133,32 @@ class Scorer:
             rows.append({**_row(method, *HEADLINE, math.nan, 0), "note": reason})
         self._earlier = frame
         return rows
+
+    def score_sets(self) -> list[dict[str, Any]]:
+        """Rows of the frame `all` for the frames scored so far: how far each method's pictures, as a set,
+        lie from the true ones. None without weights or the network of FID.
+        """
+        rows = []
+        for metric, sets in self._features.items():
+            distance, truth = SET_METRICS[metric.partition("_")[0]], sets.pop(TRUTH)
+            for method, found in sets.items():
+                # A method may lack frames; the true ones are then too many to compare with.
+                has_all = len(found) == len(truth) >= 2
+                value = distance(np.stack(found), np.stack(truth)) if has_all else math.nan
+                rows.append(_row(method, "full", metric, value, len(found)))
+                rows[-1]["note"] = "" if has_all else "it needs a picture in every frame, and two frames"
+        return rows
+
+    def _look(self, name: str, image: np.ndarray) -> Any:
+        """Activations that LPIPS scores, empty without weights; what `score_sets` needs is kept."""
+        layers = [] if self._network is None else self._network.features(image)
+        if layers:
+            mean = layers[-1].mean(dim=(0, 2, 3)).numpy()
+            for metric in (f"frechet_{self._net}", f"kernel_{self._net}"):
+                self._features.setdefault(metric, {}).setdefault(name, []).append(mean)
+        if self._inception is not None:
+            self._features.setdefault("fid", {}).setdefault(name, []).append(self._inception.describe(image))
+        return layers
 
     def _note(self, row: Mapping[str, Any], remark: str) -> str:
         if row["value"] != "":

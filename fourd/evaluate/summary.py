@@ -19,6 +19,9 @@ BOUNDS = {
     "ms_ssim": (0.0, 1.0),
     "lpips_alex": (0.0, math.inf),
     "lpips_vgg": (0.0, math.inf),
+    "fid": (0.0, math.inf),
+    "frechet_alex": (0.0, math.inf),
+    "frechet_vgg": (0.0, math.inf),
     "flicker": (0.0, math.inf),
 }
 Row = Mapping[str, str]

@@ -9,6 +9,7 @@ from fourd.errors import InputError
 from fourd.evaluate import summary
 from fourd.evaluate.camera import COLUMNS
 from fourd.evaluate.contact_sheet import stack_sheets
+from fourd.evaluate.score import MASKS
 from fourd.evaluate.summary import Summary, differences, summarize_all, summarize_rows, summary_rows
 from fourd.io import read_csv, read_image, write_csv, write_png, write_text
 
@@ -20,6 +21,11 @@ METRICS = {
     "ms_ssim": ("MS-SSIM", "{:.3f}"),
     "lpips_alex": ("LPIPS (AlexNet)", "{:.3f}"),
     "lpips_vgg": ("LPIPS (VGG)", "{:.3f}"),
+    "fid": ("FID", "{:.1f}"),
+    "frechet_alex": ("Frechet (AlexNet conv5)", "{:.3f}"),
+    "kernel_alex": ("kernel (AlexNet conv5)", "{:.4f}"),
+    "frechet_vgg": ("Frechet (VGG conv5)", "{:.3f}"),
+    "kernel_vgg": ("kernel (VGG conv5)", "{:.4f}"),
 }
 REGIONS = {
     "full": "Full frame",
@@ -27,11 +33,16 @@ REGIONS = {
     "seen_1": "seen by an input",
     "seen_2": "seen by two inputs",
     "inferred": "inferred",
+    "outside_hull": "outside the cameras",
 }
+MASK_METRICS = {"mask_iou": "IoU", "mask_precision": "precision", "mask_recall": "recall"}
 SOURCES = {"truth": "true masks", "pipeline": "masks of the workflow"}
 CONVENTIONS = (
     "MSE of 8-bit values, mean over channels. SSIM and MS-SSIM: Gaussian window of 11 px, sigma 1.5 px, "
-    "data range 255, mean over channels; DSSIM is 1 - SSIM or half of that. LPIPS: version 0.1. Flicker: "
+    "data range 255, mean over channels; DSSIM is 1 - SSIM or half of that. LPIPS: version 0.1. "
+    "Frechet and kernel distances: of all frames of a camera as a set, by the mean activation of the "
+    "network's last convolution; they are not FID. All three depend on the number of frames, so they "
+    "hold between methods of one table only. Flicker: "
     "mean absolute difference, grey levels, between the changes of render and truth from one evaluated "
     "frame to the next.",
     "[a, b]: 95 % interval of the mean for other cameras and moments of this event, by bootstrap over "
@@ -40,7 +51,8 @@ CONVENTIONS = (
     "PSNR less ours compares frame by frame, so what makes a camera hard for every method cancels.",
     "Seen: the surface, by the workflow's depth of the view, lies in the pictures of one or two inputs and "
     "nothing in the view hides it there. Inferred: no estimate covers the pixel, or the background does "
-    "with depth continued from around a hole.",
+    "with depth continued from around a hole. Outside the cameras: the view looks at the surface from more "
+    "than 5 degrees outside the cone of the directions from there to the inputs.",
 )
 
 Row = Mapping[str, str]
@@ -67,7 +79,7 @@ def read_metrics(path: Path) -> list[dict[str, str]]:
 
 def draw_table(rows: Sequence[Row], summaries: Summaries) -> str:
     """Markdown: the metrics by method in the full and the dynamic region, other regions, and notes."""
-    methods = _unique(rows, "method")
+    methods = [method for method in _unique(rows, "method") if method != MASKS]
     lines = []
     for region in ("full", "dynamic"):
         of_region = [row for row in rows if row["region"] == region]
@@ -76,7 +88,7 @@ def draw_table(rows: Sequence[Row], summaries: Summaries) -> str:
             sources = [SOURCES.get(source, source) for source in _unique(of_region, "region_source")]
             title += f" ({', '.join(sources)})"
         views = _unique(of_region, "view")
-        frames = {(row["view"], row["frame"]) for row in of_region if row["value"]}
+        frames = {(row["view"], row["frame"]) for row in of_region if row["value"] and row["metric"] == "mse"}
         lines += [
             f"{title}: mean and standard deviation over {len(frames)} frames of {', '.join(views)}, "
             "[95 % interval]",
@@ -88,6 +100,7 @@ def draw_table(rows: Sequence[Row], summaries: Summaries) -> str:
             *_camera_table(of_region, views, methods),
             "",
         ]
+    lines += _mask_lines(summaries)
     lines += ["Mean PSNR in dB by region, with its share of the frame; flicker in grey levels", ""]
     lines += [*_region_table(rows, summaries, methods), "", *_notes(summaries)]
     return "\n".join(lines)
@@ -118,6 +131,20 @@ def _cell(found: Summary | None, form: str) -> str:
     if not math.isnan(found.std):
         text += " +- " + form.replace("+", "").format(found.std)
     return text if math.isnan(found.low) else f"{text} [{form.format(found.low)}, {form.format(found.high)}]"
+
+
+def _mask_lines(summaries: Summaries) -> list[str]:
+    """How well the workflow's own masks meet the true ones, where there are any."""
+    found = [
+        (text, summaries.get(("dynamic", MASKS, metric), (None, ""))[0])
+        for metric, text in MASK_METRICS.items()
+    ]
+    words = [f"{text} {one.mean:.3f}" for text, one in found if one is not None]
+    return (
+        [f"The workflow's own masks of what moves against the true ones: {', '.join(words)}", ""]
+        if words
+        else []
+    )
 
 
 def _camera_table(rows: Sequence[Row], views: Sequence[str], methods: Sequence[str]) -> list[str]:

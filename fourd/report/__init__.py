@@ -7,7 +7,7 @@ server and no other file. What is not there is said on the page with its reason.
 
 import dataclasses
 
-STAGE_VERSION = 1
+STAGE_VERSION = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,3 +18,4 @@ class ReportOptions:
     max_frames: int = 3
     picture_px: int = 480
     error_gain: float = 4.0
+    truth: str = ""

@@ -13,7 +13,7 @@ from fourd.errors import InputError
 from fourd.io import write_csv, write_json, write_text
 from fourd.report import ReportOptions
 from fourd.report.document import Sources, check_document, collect_document
-from fourd.report.page import draw_page, film_players, read_evidence
+from fourd.report.page import draw_page, film_players, read_evidence, read_validation
 from fourd.report.pictures import collect_pictures
 
 logger = logging.getLogger(__name__)
@@ -23,9 +23,10 @@ def run(sources: Sources, output: Path, options: ReportOptions) -> None:
     """Write index.html, report.json and the data of its tables as CSV. Raises InputError."""
     document, scores = collect_document(sources)
     check_document(document)
-    shows = collect_pictures(sources.results, scores, options)
-    films = film_players(sources.results, output, options.picture_px)
-    page = draw_page(document, scores, shows, read_evidence(sources.results), films, options.picture_px)
+    shows = collect_pictures(sources.results, sources.views, scores, options)
+    films = film_players(sources.results, sources.views, output, options.picture_px)
+    evidence, validation = read_evidence(sources.results), read_validation(sources.results)
+    page = draw_page(document, scores, shows, evidence, films, validation, options.picture_px)
     write_json(output / "report.json", document)
     for name, rows in (
         ("scores", document["scores"]["rows"]),
@@ -69,8 +70,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser.parse_args(argv)
     cli.set_num_threads(1)
     settings = parse_settings(args.settings)
-    sources = Sources(args.results, args.benchmarks, args.stability, args.benches, settings)
-    run(sources, args.output, cli.options_from_args(ReportOptions, args))
+    options = cli.options_from_args(ReportOptions, args)
+    truth = Path(options.truth) if options.truth else None
+    sources = Sources(args.results, args.benchmarks, args.stability, args.benches, settings, truth)
+    run(sources, args.output, options)
 
 
 if __name__ == "__main__":

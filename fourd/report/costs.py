@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from fourd.io import read_json
 from fourd.report.numbers import parse
 
 # Rule -> folder of results that it writes, in the order of the flow; a rule not named here comes last.
@@ -24,6 +25,7 @@ FOLDER_OF_RULE = {
     "rectify_pair": "rectification",
     "disparity": "disparity",
     "judge_need": "silhouettes",
+    "survey": "plan",
     "background_plate": "silhouettes",
     "silhouettes": "silhouettes",
     "fuse_training": "foreground",
@@ -138,6 +140,29 @@ def collect_costs(results: Path, jobs: Sequence[Job]) -> dict[str, Any]:
         )
     total = {**_sum(jobs), "run_time_s": clock.total_s, "num_bytes": sum(s["num_bytes"] for s in stages)}
     return {"stages": stages, "rules": rule_rows, "total": total}
+
+
+def collect_forecast(path: Path, jobs: Sequence[Job]) -> dict[str, Any] | None:
+    """The part `forecast`: what the first plan of the scene foresaw and what the jobs took, by rule.
+
+    path: plan/plan.json, None is returned without it. Rules without a job's file have no actual time.
+    """
+    foreseen = read_json(path).get("first_forecast") if path.is_file() else None
+    if foreseen is None:
+        return None
+    rules = []
+    for rule, entry in foreseen["rules"].items():
+        own = [job for job in jobs if job.rule == rule]
+        rules.append(
+            {
+                "rule": rule,
+                "forecast_cpu_s": entry["cpu_s"] + entry["cpu_s_done"],
+                "cpu_s": _sum(own)["cpu_seconds"] if own else None,
+                "num_jobs_forecast": entry["jobs"],
+                "num_jobs": len(own),
+            }
+        )
+    return {"minutes": foreseen["minutes"], "num_cores": foreseen["num_cores"], "rules": rules}
 
 
 def _sum(jobs: Iterable[Job]) -> dict[str, Any]:

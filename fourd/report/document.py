@@ -8,9 +8,11 @@ from typing import Any
 
 import jsonschema
 
+from fourd.evaluate.score import MASKS
 from fourd.io import SCHEMA_VERSION
 from fourd.report import costs, environment, extras, progress, scene
 from fourd.report.scores import Scores, add_summary, read_notes, read_scores, summarize
+from fourd.report.truth import collect_truth
 from fourd.sfm import read_cameras
 
 SCHEMA = Path(__file__).with_name("report.schema.json")
@@ -20,7 +22,7 @@ SCHEMA = Path(__file__).with_name("report.schema.json")
 class Sources:
     """Where the figures come from. results, benchmarks: folders of one scene; the others may be missing.
 
-    settings: the configuration of the run with all defaults filled in
+    settings: the configuration of the run with all defaults filled in;  truth: true films (`truth`)
     """
 
     results: Path
@@ -28,6 +30,13 @@ class Sources:
     stability: Path | None = None
     benches: Path | None = None
     settings: Mapping[str, Any] | None = None
+    truth: Path | None = None
+
+    @property
+    def views(self) -> list[str]:
+        """Names of the views that the scene has now."""
+        trajectories = None if self.settings is None else self.settings.get("trajectories")
+        return scene.current_views(self.results, trajectories)
 
 
 def collect_document(sources: Sources) -> tuple[dict[str, Any], Scores | None]:
@@ -42,25 +51,31 @@ def collect_document(sources: Sources) -> tuple[dict[str, Any], Scores | None]:
     scores = read_scores(metrics) if metrics.is_file() else None
     rows = summarize(scores, ("region", "region_source", "method", "metric")) if scores else []
     add_summary(rows, results / "evaluate" / "summary.csv")
+    masks = {row["metric"]: row["mean"] for row in rows if row["method"] == MASKS}
+    rows = [row for row in rows if row["method"] != MASKS]
+    by_view = summarize(scores, ("view", "region", "method", "metric")) if scores else []
     jobs = costs.read_jobs(sources.benchmarks)
-    pairs = scene.collect_pairs(results)
+    pairs, views = scene.collect_pairs(results), sources.views
     document = {
         "schema_version": SCHEMA_VERSION,
         **scene.collect_scene(results),
-        "map": scene.collect_map(results),
+        "map": scene.collect_map(results, views),
+        "truth": collect_truth(results, sources.truth),
         "pairs": pairs,
         "scores": {
             "rows": rows,
-            "by_view": summarize(scores, ("view", "region", "method", "metric")) if scores else [],
+            "by_view": [row for row in by_view if row["method"] != MASKS],
+            "masks": masks,
             "notes": read_notes(results / "evaluate" / "table.md"),
         },
-        "renders": scene.collect_renders(results),
+        "renders": scene.collect_renders(results, views),
         "training": progress.collect_training(results),
         "costs": costs.collect_costs(results, jobs),
+        "forecast": costs.collect_forecast(results / "plan" / "plan.json", jobs),
         "stability": extras.collect_stability(sources.stability),
         "benches": extras.collect_benches(sources.benches),
         "ablations": extras.collect_ablations(results / "ablations"),
-        "left_out": scene.collect_left_out(results, pairs, rows),
+        "left_out": scene.collect_left_out(results, views, pairs, rows),
         "environment": environment.collect_environment(sources.settings),
     }
     heldout = [camera["name"] for camera in document["cameras"] if camera["role"] == "held out"]

@@ -48,9 +48,12 @@ def draw_page(
     shows: Sequence[FrameShow],
     evidence: Sequence[tuple[str, np.ndarray]],
     films: Sequence[Markup],
+    validation: Sequence[tuple[str, np.ndarray]],
     picture_px: int,
 ) -> str:
-    """The whole HTML file. evidence: (sentence, picture) of the clocks;  films: players."""
+    """The whole HTML file. evidence, validation: (sentence, picture) of the clocks and of training;
+    films: players.
+    """
     scene = document["scene"]
     cameras = document["cameras"]
     title = f"{scene['name']}: report"
@@ -73,7 +76,7 @@ def draw_page(
             pair_chapter(document["pairs"]),
             picture_chapter(shows, picture_px, films),
             score_chapter(document, scores),
-            progress_chapter(document),
+            progress_chapter(document, [(text, data_uri(image, EVIDENCE_PX)) for text, image in validation]),
             cost_chapter(document),
             proof_chapter(document),
             left_out_chapter(document),
@@ -119,10 +122,19 @@ def read_evidence(results: Path) -> list[tuple[str, np.ndarray]]:
     return [(text, read_image(path)) for path, text in paths.items() if path.is_file()]
 
 
-def film_players(results: Path, output: Path, picture_px: int) -> list[Markup]:
+def read_validation(results: Path) -> list[tuple[str, np.ndarray]]:
+    """What each level's network made of samples kept apart, at its last epoch, with what it shows."""
+    paths = sorted(results.glob("composition/*/validation.png"))
+    text = "samples kept apart: what is pasted, what the network makes of it, what the camera filmed."
+    return [(f"Level {path.parent.name}, {text}", read_image(path)) for path in paths]
+
+
+def film_players(results: Path, views: Sequence[str], output: Path, picture_px: int) -> list[Markup]:
     """Players of the scene's films, which stay beside the page; each shows one frame until it is started."""
     players = []
-    for path in sorted((results / "render").glob("*.mp4")):
+    for path in (results / "render" / f"{name}.mp4" for name in views):
+        if not path.is_file():
+            continue
         folders = sorted(p for p in (results / "render" / path.stem).glob("*") if p.is_dir())
         images = list(list_frames(folders).values())
         poster = data_uri(read_image(images[len(images) // 2]), picture_px) if images else None

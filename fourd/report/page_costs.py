@@ -70,8 +70,36 @@ def cost_chapter(document: Document) -> Markup:
         "background and training.",
         figure(chart, "Processor time by stage, in the order of the flow.") if busy else None,
         table(header, rows, "Stages in the order of the flow", range(1, 7)),
+        _forecast(document["forecast"]),
         more("By rule", by_rule),
     )
+
+
+def _forecast(forecast: Document | None) -> Markup:
+    """What was foreseen against what it took."""
+    if forecast is None:
+        return tag("p", "No forecast was made before the run (snakemake plan).", class_="none")
+    known = [rule for rule in forecast["rules"] if rule["cpu_s"] is not None]
+    total = {key: sum(rule[key] for rule in known) for key in ("forecast_cpu_s", "cpu_s")}
+    rows = [
+        (
+            rule["rule"],
+            f"{rule['num_jobs']} of {rule['num_jobs_forecast']}",
+            show_seconds(rule["forecast_cpu_s"]),
+            show_seconds(rule["cpu_s"]),
+        )
+        for rule in forecast["rules"]
+    ]
+    rows.append(("all that ran", "", show_seconds(total["forecast_cpu_s"]), show_seconds(total["cpu_s"])))
+    whole = table(
+        ("rule", "jobs", "forecast", "took"), rows, "Processor time, forecast and actual", range(1, 4)
+    )
+    text = (
+        f"Before the run {forecast['minutes']:.1f} minutes on {plural(forecast['num_cores'], 'core')} were "
+        f"foreseen. Of the rules that ran, {show_seconds(total['forecast_cpu_s'])} of processor time were "
+        f"foreseen and {show_seconds(total['cpu_s'])} taken."
+    )
+    return join(tag("p", text), more("Forecast and actual by rule", whole))
 
 
 def proof_chapter(document: Document) -> Markup:

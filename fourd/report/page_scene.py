@@ -51,6 +51,7 @@ def filmed(document: Document, evidence: Sequence[tuple[str, str]]) -> Markup:
         if evidence
         else None,
         _residuals(document["cameras"]),
+        _against_truth(document),
     )
 
 
@@ -106,6 +107,48 @@ def _residuals(cameras: Sequence[Document]) -> Markup:
     errors = [(c["name"], c["reprojection_error_px"]) for c in known]
     chart = bar_chart([(name, v, f"{show(v, 2)} px") for name, v in errors], "Reprojection error by camera")
     return figure(chart, "How far static points lie from where each camera saw them, root mean square.")
+
+
+def _against_truth(document: Document) -> Markup | None:
+    """Recovered cameras and clocks against true ones."""
+    truth = document["truth"]
+    if truth is None:
+        return None
+    fps = document["scene"]["fps"]
+    clocks = {row["name"]: row["error_s"] for row in truth["clocks"]}
+    cameras = {row["name"]: row for row in truth["cameras"]}
+    rows = []
+    for name in dict.fromkeys([*cameras, *clocks]):
+        row, error_s = cameras.get(name, {}), clocks.get(name)
+        shares = [row.get(key) for key in ("center_share", "focal_share")]
+        rows.append(
+            (
+                name,
+                show(row.get("rotation_deg"), 2),
+                show(row.get("center"), 2),
+                *("-" if share is None else f"{share:.3%}" for share in shares),
+                "-" if error_s is None else f"{error_s * 1e3:+.1f}",
+                "-" if error_s is None else f"{error_s * fps:+.2f}",
+            )
+        )
+    header = (
+        "camera",
+        "turned by, deg",
+        "centre off by",
+        "of the distance",
+        "focal length",
+        "clock, ms",
+        "clock, frames",
+    )
+    if not rows:
+        return tag("p", "True cameras were given, but none of them was recovered.", class_="none")
+    return table(
+        header,
+        rows,
+        "Against the truth: poses after the best similarity of the two worlds, in the true world's units, "
+        "clocks after the best shift",
+        range(1, 7),
+    )
 
 
 def _how(pair: Document) -> Markup:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from fourd.evaluate.table import MASK_METRICS
 from fourd.report.charts import Series, line_chart, scatter_chart
 from fourd.report.html import Markup, figure, join, more, section, table, tag
 from fourd.report.numbers import plural, show, show_seconds
@@ -19,6 +20,7 @@ from fourd.report.scores import (
 )
 
 Document = Mapping[str, Any]
+SET_METRICS = ("fid", "frechet_", "kernel_")
 SOURCES = {"truth": "true masks", "pipeline": "masks of the workflow"}
 REGIONS = {
     "full": "Full frame",
@@ -26,6 +28,7 @@ REGIONS = {
     "static": "What stands still",
     "seen_1": "Seen by an input",
     "seen_2": "Seen by two inputs",
+    "outside_hull": "From outside the cameras",
 }
 
 
@@ -56,6 +59,8 @@ def score_chapter(document: Document, scores: Scores | None) -> Markup:
             _method_table([r for r in rows if (r["region"], r["region_source"]) == pair], region_title(*pair))
             for pair in regions[:2]
         ],
+        _mask_line(document["scores"]["masks"]),
+        _set_table(rows),
         _region_table(rows, metric),
         tag("ul", [tag("li", note) for note in document["scores"]["notes"]], class_="notes"),
         _view_table(document["scores"]["by_view"], metric, views),
@@ -69,7 +74,29 @@ def score_chapter(document: Document, scores: Scores | None) -> Markup:
     )
 
 
+def _mask_line(masks: Mapping[str, float | None]) -> Markup | None:
+    """The workflow's own masks against true ones."""
+    words = [f"{text} {show(masks[key])}" for key, text in MASK_METRICS.items() if masks.get(key) is not None]
+    text = "The workflow's own masks of what moves, against the true ones: "
+    return tag("p", text + ", ".join(words) + ".") if words else None
+
+
+def _set_table(rows: Sequence[Document]) -> Markup | None:
+    """Distances of all pictures of a camera as a set."""
+    chosen = [row for row in rows if row["metric"].startswith(SET_METRICS) and row["mean"] is not None]
+    if not chosen:
+        return None
+    num_views = max(row["num_values"] for row in chosen)
+    return _metric_table(chosen, f"All pictures of a camera as a set, {plural(num_views, 'camera')}")
+
+
 def _method_table(rows: Sequence[Document], title: str) -> Markup:
+    rows = [row for row in rows if not row["metric"].startswith(SET_METRICS)]
+    num_frames = max(row["num_values"] + row["num_infinite"] for row in rows)
+    return _metric_table(rows, f"{title}, {plural(num_frames, 'frame')}")
+
+
+def _metric_table(rows: Sequence[Document], title: str) -> Markup:
     # A metric that could not be measured is named in the notes; it needs no column of dashes.
     metrics = list(dict.fromkeys(r["metric"] for r in rows if r["num_values"] + r["num_infinite"]))
     methods = list(dict.fromkeys(row["method"] for row in rows))
@@ -88,8 +115,7 @@ def _method_table(rows: Sequence[Document], title: str) -> Markup:
         for method in methods
     ]
     arrows = [f"{metric_label(m)} {'↑' if is_higher_better(m) else '↓'}" for m in metrics]
-    num_frames = max(row["num_values"] + row["num_infinite"] for row in rows)
-    return table(("method", *arrows), body, f"{title}, {plural(num_frames, 'frame')}", range(1, 99))
+    return table(("method", *arrows), body, title, range(1, 99))
 
 
 def num_decimals(values: Sequence[float]) -> int:
@@ -169,7 +195,7 @@ def _other_curves(scores: Scores, regions: Sequence[tuple[str, str]], headline: 
         )
         for region, source in regions
         for metric in scores.names["metric"]
-        if (region, metric) not in shown
+        if (region, metric) not in shown and not metric.startswith((*SET_METRICS, "mask_"))
     ]
     views = scores.names["view"]
     if headline and len(views) > 1 and regions:
@@ -181,8 +207,11 @@ def _other_curves(scores: Scores, regions: Sequence[tuple[str, str]], headline: 
     return figures
 
 
-def progress_chapter(document: Document) -> Markup:
-    """Training curves, and error against run time."""
+def progress_chapter(document: Document, validation: Sequence[tuple[str, str]]) -> Markup:
+    """Training curves and pictures, and error against run time.
+
+    validation: (sentence, data URI) of samples kept apart
+    """
     timing = document["error_time"]
     metric = timing["metric"]
     body: list[Markup | None] = []
@@ -215,6 +244,7 @@ def progress_chapter(document: Document) -> Markup:
         )
     for level in document["training"]:
         body.append(_training_figure(level))
+    body += [figure(tag("img", src=uri, alt=text), text) for text, uri in validation]
     return section(
         "progress",
         "Error against time",

@@ -84,10 +84,15 @@ def choose_frames(view: View, scores: Scores | None, max_frames: int) -> list[tu
     return [(ranked[i][0], words.get(i, f"number {i + 1} of {len(ranked)} from the worst")) for i in places]
 
 
-def collect_pictures(results: Path, scores: Scores | None, options: ReportOptions) -> list[FrameShow]:
-    """Pictures of the chosen frames; a file that is gone leaves a place with its reason."""
+def collect_pictures(
+    results: Path, views: Sequence[str], scores: Scores | None, options: ReportOptions
+) -> list[FrameShow]:
+    """Pictures of the chosen frames; a file that is gone leaves a place with its reason.
+
+    views: names of the views that the scene has now
+    """
     scene = read_cameras(results / "sfm" / "cameras.json")
-    rendered = [path.name for path in (results / "render").glob("*") if path.is_dir()]
+    rendered = [name for name in views if (results / "render" / name).is_dir()]
     shows = []
     for name in choose_views(scene, rendered, options.max_views):
         view = read_view(results / "views" / f"{name}.json")

@@ -16,6 +16,7 @@ READY_AFTER = {
     "nn_all_times": ("prepare_camera", "place_view"),
     "sfm": ("prepare_camera", "place_view"),
     "sfm_dense": ("prepare_camera", "place_view"),
+    "sfm_humans": ("prepare_camera", "place_view"),
     "inst": ("fuse_foreground",),
     "background": ("estimate_background",),
     "paste": ("fuse_foreground", "estimate_background"),

@@ -1,7 +1,7 @@
 """What was filmed, from where and when: cameras, clocks, pairs, and what was left out with its reason."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,22 @@ def collect_scene(results: Path) -> dict[str, Any]:
     }
 
 
+def current_views(results: Path, trajectories: Collection[str] | None) -> list[str]:
+    """Names of the views that the scene has now: its cameras, and films of the configuration.
+
+    trajectories: names in the configuration, None where it is not known. Results of a camera that was
+    taken out of the scene, or of a film that is no longer asked for, may still lie there.
+    """
+    document = read_json(results / "sfm" / "cameras.json")
+    cameras = {*document["inputs"], *document["heldout"], *document["left_out"]}
+    return [
+        path.stem
+        for path in sorted((results / "views").glob("*.json"))
+        if path.stem in cameras
+        or (read_json(path)["role"] == "virtual" and (trajectories is None or path.stem in trajectories))
+    ]
+
+
 def _read_if_there(path: Path) -> dict[str, Any]:
     return read_json(path) if path.is_file() else {}
 
@@ -96,10 +112,11 @@ def _describe_camera(
     }
 
 
-def collect_map(results: Path) -> dict[str, Any]:
+def collect_map(results: Path, views: Sequence[str]) -> dict[str, Any]:
     """The part `map`: everything seen from above, (x, y) in world units.
 
-    y points where the input cameras look on average, so that the event lies in the upper half.
+    views: of `current_views`. y points where the input cameras look on average, so that the event
+    lies in the upper half.
     """
     document = read_json(results / "sfm" / "cameras.json")
     up = np.asarray(document["up"], np.float64)
@@ -122,11 +139,11 @@ def collect_map(results: Path) -> dict[str, Any]:
             }
         )
     trajectories = []
-    for path in sorted((results / "views").glob("*.json")):
-        view = read_json(path)
+    for name in views:
+        view = read_json(results / "views" / f"{name}.json")
         if view["role"] == "virtual" and view["frames"]:
             centers, _ = _poses(view["frames"])
-            trajectories.append({"name": path.stem, "path": _thin(centers @ ground.T)})
+            trajectories.append({"name": name, "path": _thin(centers @ ground.T)})
     all_centers = np.concatenate([centers for centers, _ in poses.values()] or [np.zeros((1, 3))])
     points = _points_near(results / "sfm" / "points.npz", all_centers)
     return {
@@ -174,7 +191,12 @@ def _points_near(path: Path, centers: np.ndarray) -> np.ndarray:
 def collect_pairs(results: Path) -> list[dict[str, Any]]:
     """The part `pairs`: how each pair of input cameras is matched, or why it is not."""
     pairs = []
+    document = read_json(results / "sfm" / "cameras.json")
+    # A camera that was taken out, or is held out now, is in no pair.
+    cameras = {*document["inputs"], *document["left_out"]}
     for path in sorted((results / "rectification").glob("*.npz")):
+        if not cameras.issuperset(path.stem.split("-")):
+            continue
         with closing(Archive(path)) as archive:
             meta = archive.meta
         guard = meta.get("guard", {})
@@ -195,11 +217,13 @@ def collect_pairs(results: Path) -> list[dict[str, Any]]:
     return pairs
 
 
-def collect_renders(results: Path) -> list[dict[str, Any]]:
+def collect_renders(results: Path, views: Sequence[str]) -> list[dict[str, Any]]:
     """The part `renders`: per view and level the share of blank pixels and why coarser levels help or not."""
     renders = []
-    for view in sorted(p for p in (results / "render").glob("*") if p.is_dir()):
-        rows = [row for path in sorted(view.glob("*/holes.csv")) for row in read_csv(path)]
+    for view in views:
+        rows = [
+            row for path in sorted((results / "render" / view).glob("*/holes.csv")) for row in read_csv(path)
+        ]
         for level in sorted({row["level"] for row in rows}):
             own = [row for row in rows if row["level"] == level]
             holes, filled = (
@@ -207,7 +231,7 @@ def collect_renders(results: Path) -> list[dict[str, Any]]:
             )
             renders.append(
                 {
-                    "view": view.name,
+                    "view": view,
                     "level": level,
                     "num_frames": len(own),
                     "mean_hole_share": sum(holes) / len(own),
@@ -220,13 +244,16 @@ def collect_renders(results: Path) -> list[dict[str, Any]]:
 
 
 def collect_left_out(
-    results: Path, pairs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]]
+    results: Path,
+    views: Sequence[str],
+    pairs: Sequence[Mapping[str, Any]],
+    rows: Sequence[Mapping[str, Any]],
 ) -> list[dict[str, str]]:
     """The part `left_out`: cameras, pairs, views, frames, stages and methods without result, with the reason.
 
     pairs, rows: of the parts `pairs` and `scores`
     """
-    found = [*_left_out(results, pairs), *_empty_methods(rows)]
+    found = [*_left_out(results, views, pairs), *_empty_methods(rows)]
     return [{"kind": kind, "name": name, "reason": reason} for kind, name, reason in found]
 
 
@@ -237,18 +264,21 @@ def _empty_methods(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str
             yield "method", method, own[0]["note"] or "it has no picture in any frame"
 
 
-def _left_out(results: Path, pairs: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str, str]]:
+def _left_out(
+    results: Path, views: Sequence[str], pairs: Sequence[Mapping[str, Any]]
+) -> Iterator[tuple[str, str, str]]:
     cameras = read_json(results / "sfm" / "cameras.json")
     for name, reason in cameras["left_out"].items():
         yield "camera", name, reason
-    for path in sorted((results / "views").glob("*.json")):
-        status = read_json(path)["status"]
-        if status != "ok" and path.stem not in cameras["left_out"]:
-            yield "view", path.stem, status
+    for name in views:
+        status = read_json(results / "views" / f"{name}.json")["status"]
+        if status != "ok" and name not in cameras["left_out"]:
+            yield "view", name, status
     for pair in pairs:
         if pair["status"] != "ok":
             yield "pair", pair["pair"], pair["status"]
-    for path in sorted((results / "foreground").glob("*/*.npz")):
+    paths = [path for name in views for path in sorted((results / "foreground" / name).glob("*.npz"))]
+    for path in paths:
         with closing(Archive(path)) as archive:
             for frame, status in archive.meta.get("frame_status", {}).items():
                 if status != "ok":

@@ -118,8 +118,6 @@ def test_methods_without_their_material_say_why():
         METHODS["sfm"](make_evidence())
     with pytest.raises(Unavailable, match="no sparse point lies in the held-out view"):
         METHODS["sfm_dense"](make_evidence(points=np.array([[0.0, 0, -3]])))
-    with pytest.raises(Unavailable, match="not built"):
-        METHODS["sfm_humans"](make_evidence())
 
 
 def test_neighbour_feature_prefers_the_same_structure():

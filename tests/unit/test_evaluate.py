@@ -18,7 +18,9 @@ from fourd.evaluate.__main__ import main
 from fourd.evaluate.camera import COLUMNS, score_image
 from fourd.geometry import look_at
 from fourd.sfm import SceneCameras, write_cameras
+from tests.conftest import REPOSITORY
 from tests.films import put_on_clock
+from tests.unit.test_metrics_fid import write_network
 
 SIZE = (96, 64)
 SCHEMA = Path(__file__).resolve().parents[2] / "config" / "schemas" / "evaluate.schema.yaml"
@@ -155,10 +157,14 @@ def test_one_camera_is_scored_by_every_method(scene, tmp_path):
     main(camera_command(scene, tmp_path))
     rows = read_rows(tmp_path / "cam01.csv")
     assert tuple(rows[0]) == COLUMNS
+    masks = [row for row in rows if row["method"] == "masks"]
+    rows = [row for row in rows if row["method"] != "masks"]
     assert set(Counter((row["frame"], row["method"]) for row in rows if row["value"]).values()) <= {15, 17}
+    assert [row["metric"] for row in masks] == 3 * ["mask_iou", "mask_precision", "mask_recall"]
+    assert all(float(row["value"]) > 0.7 for row in masks)
     sources = {row["region"]: row["region_source"] for row in rows}
     assert sources == dict.fromkeys(("full", "static", "dynamic"), "truth") | dict.fromkeys(
-        ("seen_1", "seen_2", "inferred"), "pipeline"
+        ("seen_1", "seen_2", "inferred", "outside_hull"), "pipeline"
     )
     assert list(dict.fromkeys(row["method"] for row in rows)) == list(METHODS)
     assert {row["view"] for row in rows} == {"cam01"}
@@ -209,14 +215,43 @@ def test_every_value_that_is_missing_has_its_reason(scene, tmp_path):
         "no sparse points" in missing["sfm", "psnr_db"]
         and "no sparse points" in missing["sfm_dense", "psnr_db"]
     )
-    assert missing["sfm_humans", "psnr_db"] == "not built: needs a pose and a body model"
+    assert missing["sfm_humans", "psnr_db"].startswith("no models are given: install the extra `humans`")
     notes = {row["note"] for row in rows if row["method"] == "nn_all_times" and row["value"]}
     assert notes == {"feature: thumbnail and gradient histograms"}
     text = table.draw_table(rows, summary.summarize_all(rows))
     assert "| SfM+humans | - | - | - | - | - | - |" in text
-    assert "- SfM+humans: not built: needs a pose and a body model" in text
+    assert "- SfM+humans: no models are given: install the extra `humans`" in text
     assert "- LPIPS (AlexNet): no weights are given" in text
     assert "- N.N. same-time, N.N. all-time: feature: thumbnail and gradient histograms" in text
+
+
+def test_with_weights_neighbours_compare_conv5_and_sets_are_compared(scene, tmp_path):
+    weights = REPOSITORY / "data" / "lpips"
+    if not (weights / "alexnet.ckpt").is_file():
+        pytest.skip(f"needs the weights: python -m fourd.fetch lpips --output {weights}")
+    main([*camera_command(scene, tmp_path), "--lpips-weights", str(weights)])
+    rows = read_rows(tmp_path / "cam01.csv")
+    notes = {row["note"] for row in rows if row["method"] == "nn_same_time" and row["value"]}
+    assert "feature: AlexNet conv5" in notes and "feature: thumbnail and gradient histograms" not in notes
+    # cam02 films the same place as the held-out camera, so its picture is the nearest in every frame.
+    assert value_of(rows, "nn_same_time", "full", "mse", 1) < value_of(rows, "background", "full", "mse", 1)
+    lpips = {m: value_of(rows, m, "full", "lpips_alex", 2) for m in ("ours", "background")}
+    assert 0 < lpips["ours"] < lpips["background"]
+    sets = {(r["method"], r["metric"]): r["value"] for r in rows if r["frame"] == "all"}
+    assert float(sets["ours", "frechet_alex"]) < float(sets["background", "frechet_alex"])
+    assert float(sets["ours", "kernel_alex"]) < float(sets["background", "kernel_alex"])
+    text = table.draw_table(rows, summary.summarize_all(rows))
+    assert "over 3 frames of cam01" in text and "Frechet (AlexNet conv5)" in text
+
+
+def test_fid_is_there_only_with_the_network_that_a_user_brings(scene, tmp_path):
+    main(camera_command(scene, tmp_path))
+    assert not any(row["metric"] == "fid" for row in read_rows(tmp_path / "cam01.csv"))
+    network = write_network(tmp_path / "net.pt", 2048)
+    main([*camera_command(scene, tmp_path), "--inception", str(network)])
+    fid = {r["method"]: r for r in read_rows(tmp_path / "cam01.csv") if r["metric"] == "fid"}
+    assert 0 < float(fid["ours"]["value"]) < float(fid["sfm"]["value"])
+    assert fid["ours"]["frame"] == "all" and fid["ours"]["num_pixels"] == "3"
 
 
 def test_renders_of_other_programs_are_scored_beside_ours(scene, tmp_path):
@@ -226,7 +261,7 @@ def test_renders_of_other_programs_are_scored_beside_ours(scene, tmp_path):
     main(camera_command(scene, tmp_path, other=[f"splats={tmp_path / 'splats'}"]))
     rows = read_rows(tmp_path / "cam01.csv")
     assert value_of(rows, "splats", "full", "mse", 2) == 36
-    assert list(dict.fromkeys(row["method"] for row in rows))[-2:] == ["splats", "ours"]
+    assert list(dict.fromkeys(row["method"] for row in rows))[-3:] == ["splats", "ours", "masks"]
     (tmp_path / "splats" / HELDOUT / "000001.png").unlink()
     with pytest.raises(InputError, match=r"every evaluated frame of cam01, but .*000001.png is missing"):
         main(camera_command(scene, tmp_path, other=[f"splats={tmp_path / 'splats'}"]))
@@ -293,7 +328,7 @@ def test_empty_region_is_written_as_nothing_not_as_nan(scene, tmp_path):
         io.write_png(tmp_path / "still" / f"{frame:06d}.png", np.zeros((64, 96), np.uint8))
     main(camera_command(scene, tmp_path, labels=tmp_path / "still"))
     rows = read_rows(tmp_path / "cam01.csv")
-    dynamic = [row for row in rows if row["region"] == "dynamic"]
+    dynamic = [row for row in rows if row["region"] == "dynamic" and row["method"] != "masks"]
     assert {(row["value"], row["num_pixels"], row["note"]) for row in dynamic} == {
         ("", "0", "the region is empty")
     }
@@ -345,7 +380,7 @@ def test_results_of_another_size_are_refused(scene, tmp_path):
 
 def test_a_held_out_camera_makes_no_render():
     stages = Path(cli.__file__).parent
-    readers = ("evaluate", "baselines", "report")
+    readers = ("evaluate", "baselines", "report", "export")
     makers = [p for p in stages.rglob("*.py") if p.relative_to(stages).parts[0] not in readers]
     importing = [
         p.name for p in makers if "fourd.evaluate" in p.read_text() or "fourd.baselines" in p.read_text()

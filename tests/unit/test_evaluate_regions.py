@@ -8,8 +8,9 @@ import numpy as np
 from fourd import metrics
 from fourd.camera import Camera
 from fourd.evaluate import EvaluateOptions, regions
+from fourd.evaluate.regions import find_outside_hull
 from fourd.image import undistort
-from tests.unit.baseline_evidence import make_evidence
+from tests.unit.baseline_evidence import VIEW, make_evidence
 
 SIZE = (96, 64)
 
@@ -82,3 +83,45 @@ def test_regions_of_the_surface_come_from_depth_agreement_and_fill():
     np.testing.assert_array_equal(found["seen_2"], agreed == 2)
     np.testing.assert_array_equal(found["seen_1"], agreed >= 1)
     np.testing.assert_array_equal(found["inferred"], filled)
+
+
+def plane_camera(x: float, y: float = 0.0) -> Camera:
+    return dataclasses.replace(VIEW, t=np.array([-x, -y, 0.0]))
+
+
+def test_outside_the_hull_is_the_angle_to_the_cone_of_the_inputs():
+    depth = np.full((64, 96), 10.0, np.float32)
+    # Seen from (0, 0, 10), cameras at +-1 span +-5.7 degrees in x and nothing in y.
+    centers = [np.array([-1.0, 0, 0]), np.array([1.0, 0, 0])]
+    for x, y, is_outside in ((0, 0, False), (1.5, 0, False), (2.5, 0, True), (0, 0.7, False), (0, 1.4, True)):
+        found = find_outside_hull(depth, plane_camera(x, y), centers)
+        assert found.shape == depth.shape and found[32, 48] == is_outside, (x, y)
+        assert found.all() == is_outside
+    assert find_outside_hull(depth, plane_camera(0, 1.4), [*centers, np.array([0.0, 3, 0])]).sum() == 0
+
+
+def test_pixels_without_depth_and_the_sky_are_not_outside():
+    depth = np.full((64, 96), np.nan, np.float32)
+    depth[:, :48] = np.inf
+    assert not find_outside_hull(depth, plane_camera(30.0), [np.zeros(3), np.ones(3)]).any()
+    depth[:, :48] = 10
+    found = find_outside_hull(depth, plane_camera(30.0), [np.zeros(3), np.ones(3)])
+    np.testing.assert_array_equal(found, ~np.isnan(depth))
+
+
+def test_a_view_behind_the_scene_is_outside():
+    R = np.diag([-1.0, 1, -1])
+    behind = dataclasses.replace(VIEW, R=R, t=-R @ np.array([0, 0, 20.0]))
+    assert find_outside_hull(np.full((64, 96), 10.0, np.float32), behind, [np.zeros(3), np.ones(3)]).all()
+
+
+def test_masks_are_compared_by_their_pixels():
+    found, true = np.zeros((10, 10), bool), np.zeros((10, 10), bool)
+    found[:4], true[2:6] = True, True
+    assert regions.compare_masks(found, true) == {
+        "mask_iou": 20 / 60,
+        "mask_precision": 0.5,
+        "mask_recall": 0.5,
+    }
+    nothing = regions.compare_masks(np.zeros((10, 10), bool), true)
+    assert nothing["mask_iou"] == 0 and np.isnan(nothing["mask_precision"])

@@ -154,7 +154,7 @@ def test_truth_that_is_gone_is_said(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "results", path)
     for film in (path / "frames" / "cameras").glob("*.npz"):
         film.unlink()
-    shows = pictures.collect_pictures(path, None, ReportOptions(max_frames=1))
+    shows = pictures.collect_pictures(path, [report_scene.HELDOUT], None, ReportOptions(max_frames=1))
     assert shows[0].truth is None and shows[0].rendered is not None
     assert any(p.title == "truth" and p.image is None and "cam01" in p.caption for p in shows[0].pictures)
 
