@@ -117,7 +117,7 @@ def choose_torch_device(name: str) -> str:
 def run_stage(main: Callable[[Sequence[str] | None], None], argv: Sequence[str] | None = None) -> int:
     """Run a stage's `main`; turn expected failures into one sentence and an exit status.
 
-    Returns 0, 2 for unusable input, 3 when a file could not be written or read.
+    Returns 0, 2 for unusable input, 3 when a file could not be written or read, 4 without memory.
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     try:
@@ -128,7 +128,22 @@ def run_stage(main: Callable[[Sequence[str] | None], None], argv: Sequence[str] 
     except OSError as error:
         print(f"error: {_explain_os_error(error)}", file=sys.stderr)
         return 3
+    except Exception as error:
+        # What lacks memory has a different type in every library; anything else is a programming error.
+        if not _lacks_memory(error):
+            raise
+        print(
+            "error: not enough memory for this job: run fewer jobs at a time (--cores) or on a computer with "
+            "more memory; finished files are whole and kept",
+            file=sys.stderr,
+        )
+        return 4
     return 0
+
+
+def _lacks_memory(error: Exception) -> bool:
+    words = ("not enough memory", "out of memory", "insufficient memory", "can't allocate memory")
+    return isinstance(error, MemoryError) or any(word in str(error).lower() for word in words)
 
 
 def _explain_os_error(error: OSError) -> str:
@@ -138,6 +153,8 @@ def _explain_os_error(error: OSError) -> str:
             f"the disk is full: {where} could not be written. Finished files are whole and kept; "
             "free some space and run the same command again"
         )
+    if error.errno == errno.ENOMEM:
+        return f"not enough memory to use {where}: run fewer jobs at a time (--cores)"
     if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
         return f"no permission to use {where}: give write access or choose another results folder"
     if error.errno == errno.ENOENT:

@@ -8,6 +8,7 @@ import contextlib
 import csv
 import json
 import os
+import re
 import shutil
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,6 +21,15 @@ import numpy as np
 from fourd.errors import InputError
 
 SCHEMA_VERSION = 1
+# A picture of some kilobytes can unpack to gigabytes. OpenCV reads these when it opens its first picture.
+MAX_IMAGE_SIDE_PX = 16384
+MAX_IMAGE_PIXELS = 2**27
+for _limit, _value in {
+    "WIDTH": MAX_IMAGE_SIDE_PX,
+    "HEIGHT": MAX_IMAGE_SIDE_PX,
+    "PIXELS": MAX_IMAGE_PIXELS,
+}.items():
+    os.environ.setdefault(f"OPENCV_IO_MAX_IMAGE_{_limit}", str(_value))
 
 
 @contextlib.contextmanager
@@ -37,6 +47,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         with temporary.open("rb") as handle:
             os.fsync(handle.fileno())
         temporary.replace(final)
+        _remove_leftovers(final)
     except OSError as error:
         if error.filename in (None, str(temporary)):
             error.filename = str(final)
@@ -47,22 +58,34 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def atomic_folder(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; it takes the place of `path` when the block succeeds.
-
-    One job writes a folder, so a temporary one that lies there was left by a job that was killed.
-    """
+    """Yield a temporary folder beside `path`; it takes the place of `path` when the block succeeds."""
     final = Path(path)
     final.parent.mkdir(parents=True, exist_ok=True)
-    temporary = final.with_name(f".{final.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
+    temporary = final.with_name(f".{final.name}.tmp{os.getpid()}")
     temporary.mkdir()
     try:
         yield temporary
         if final.exists():
             shutil.rmtree(final)
         temporary.replace(final)
+        _remove_leftovers(final)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _remove_leftovers(final: Path) -> None:
+    """Remove what killed jobs left beside a finished file or folder.
+
+    Afterwards, as a job whose engine was killed may live on and still be writing its own.
+    """
+    stem, name, suffix = map(re.escape, (final.stem, final.name, final.suffix))
+    is_left = re.compile(rf"\.({stem}\.tmp\d*{suffix}|{name}\.tmp\d*)").fullmatch
+    for path in final.parent.iterdir():
+        if is_left(path.name):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
 
 
 def write_text(path: Path | str, text: str) -> None:
@@ -84,8 +107,11 @@ def read_json(path: Path | str) -> dict[str, Any]:
         raise InputError(f"expected a JSON file at {source}, found nothing: check the path")
     try:
         document = json.loads(source.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"expected JSON in {source}, got: {error}; write the file anew") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"expected JSON in {source}, got: {error}; write the file anew, or delete it and run again if "
+            "the workflow made it"
+        ) from None
     if not isinstance(document, dict):
         raise InputError(f"expected a JSON object in {source}, got a {type(document).__name__}")
     return document
@@ -100,9 +126,19 @@ def write_csv(path: Path | str, columns: Sequence[str], rows: Iterable[Mapping[s
 
 
 def read_csv(path: Path | str) -> list[dict[str, str]]:
-    """Rows of a CSV table as dictionaries of strings."""
-    with Path(path).open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    """Rows of a CSV table as dictionaries of strings. Raises InputError for a table that was cut off."""
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise InputError(f"expected a table in {path}, got: {error}; delete it and run again") from None
+    for number, row in enumerate(rows, start=1):
+        if None in row or None in row.values():
+            raise InputError(
+                f"expected as many values as columns in row {number} of {path}, got others: the table is cut "
+                "off or damaged, delete it and run again"
+            )
+    return rows
 
 
 class ArchiveWriter:
@@ -152,7 +188,7 @@ class Archive:
         try:
             self._zip = zipfile.ZipFile(self.path)
             self.meta: dict[str, Any] = json.loads(self["meta"].tobytes())
-        except (zipfile.BadZipFile, KeyError, OSError) as error:
+        except (zipfile.BadZipFile, KeyError, OSError, ValueError) as error:
             raise InputError(
                 f"expected a whole archive of this workflow at {self.path}, got: {error}; "
                 "delete the file and run again"
@@ -193,7 +229,13 @@ def read_image(path: Path | str) -> np.ndarray:
     source = Path(path)
     if not source.is_file():
         raise InputError(f"expected an image at {source}, found nothing: check the path")
-    image = cv2.imread(str(source), cv2.IMREAD_COLOR)
+    try:
+        image = cv2.imread(str(source), cv2.IMREAD_COLOR)
+    except cv2.error:
+        raise InputError(
+            f"expected an image of at most {MAX_IMAGE_SIDE_PX} px a side and {MAX_IMAGE_PIXELS} px in all at "
+            f"{source}, got a larger one: resize it"
+        ) from None
     if image is None:
         raise InputError(f"expected an image that can be decoded at {source}: replace the file")
     return np.ascontiguousarray(image[:, :, ::-1])

@@ -18,8 +18,7 @@ rule train_level:
         "<benchmarks>/{scene}/train_level/{level}.tsv"
     conda:
         "../envs/torch.yaml"
-    # As many as there are: the engine caps it at --cores.
-    threads: 16
+    threads: config["composition"]["num_threads"]
     resources:
         gpu=1,
     params:
@@ -30,5 +29,5 @@ rule train_level:
         "python -m fourd.composition train --level {wildcards.level}"
         " --num-levels {params.num_levels} --views {input.views} --cameras {input.cameras}"
         " --films {input.films} --foreground {input.foreground} --background {input.background}"
-        " {params.options} --threads {threads} --output-model {output.model}"
+        " {params.options} --output-model {output.model}"
         " --output-log {output.table} --output-picture {output.picture} 2> >(tee {log} >&2)"

@@ -13,6 +13,11 @@ DEMO_FLAGS = flags_from_mapping(
 )
 
 
+# Sources of a scene below data/demo are made here: what is no camera's name is no source.
+wildcard_constraints:
+    demo_cam=r"cam\d+",
+
+
 rule demo_frames:
     output:
         directory("data/demo/frames/{demo_cam}"),

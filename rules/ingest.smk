@@ -35,6 +35,7 @@ rule probe_background:
     threads: 1
     params:
         fps=SCENE.fps,
+        stamp=lambda wildcards: source_stamp(SCENE.cameras[wildcards.cam].background, MADE_BY_RULES),
         options=options("ingest"),
         version=fourd_config.stage_version("ingest"),
     shell:
@@ -58,6 +59,8 @@ rule probe_camera:
     params:
         # Of folders of images, which have no times of their own.
         fps=SCENE.fps,
+        # The engine compares times with those of the outputs only: an older film would not be noticed.
+        stamp=lambda wildcards: source_stamp(SCENE.cameras[wildcards.cam].source, MADE_BY_RULES),
         options=options("ingest"),
         version=fourd_config.stage_version("ingest"),
     shell:

@@ -33,6 +33,7 @@ class CompositionOptions:
     patience: int | None = None
     seed: int = 0
     precision: str = "auto"
+    num_threads: int = 2
     max_minutes: float | None = None
     checkpoint_s: float = 60.0
     cache_mb: int = 1024

@@ -185,7 +185,6 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     command.add_argument("--output-model", type=Path, required=True)
     command.add_argument("--output-log", type=Path, required=True)
     command.add_argument("--output-picture", type=Path, required=True)
-    command.add_argument("--threads", type=int, default=1)
     command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     cli.add_options(command, CompositionOptions)
     return parser.parse_args(argv)
@@ -194,7 +193,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def main(argv: Sequence[str] | None = None) -> None:
     """Train one level from files."""
     args = parse(argv)
-    cli.set_num_threads(args.threads)
+    cli.set_num_threads(args.num_threads)
     device = cli.choose_torch_device(args.device)
     if device == "cuda":
         # Levels are jobs of their own: where there are several devices, they train at the same time.
