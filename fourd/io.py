@@ -129,7 +129,7 @@ def read_csv(path: Path | str) -> list[dict[str, str]]:
     """Rows of a CSV table as dictionaries of strings. Raises InputError for a table that was cut off."""
     try:
         with Path(path).open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+            rows = list(csv.DictReader(file, strict=True))
     except (csv.Error, UnicodeDecodeError) as error:
         raise InputError(f"expected a table in {path}, got: {error}; delete it and run again") from None
     for number, row in enumerate(rows, start=1):

@@ -43,6 +43,7 @@ def write_profile(folder: Path, **changes: object) -> None:
     """profiles/slurm on one node of two cores, in a hurry."""
     profile = yaml.safe_load((REPOSITORY / "profiles" / "slurm" / "profile.yaml").read_text())
     profile |= {"cores": 2, "jobs": 8, "latency-wait": 5, "slurm-init-seconds-before-status-checks": 1}
+    profile["seconds-between-status-checks"] = 1
     profile["default-resources"] = ["mem_mb=1000 * attempt", "runtime=10"]
     for resources in profile["set-resources"].values():
         resources["mem_mb"] = "1500 * attempt"

@@ -121,7 +121,8 @@ def test_killed_at_random_moments_it_goes_on_and_ends_with_the_same_bytes(
     assert digests(tmp_path) == digests(whole.folder)
     assert [path for path in tmp_path.rglob("*") if ".tmp" in path.name and "data" in path.parts] == []
     assert [path for path in (tmp_path / "results").rglob("*") if ".tmp" in path.name] == []
-    assert unfinished(tmp_path) == []
+    # A mark alone is none: what a job of a killed run was to make for another need not be made again.
+    assert [path for path in unfinished(tmp_path) if path.exists()] == []
 
 
 def test_second_run_on_the_same_results_refuses_politely(copied: Workspace) -> None:

@@ -1,19 +1,13 @@
 """The whole workflow on a tiny event, called as a user calls it."""
 
-import hashlib
-import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from fourd.io import read_csv, read_json
 from fourd.video import probe_video
-from tests.conftest import REPOSITORY, Workspace, tiny_scene
+from tests.conftest import Workspace, tiny_scene
 
 FILMS = ("freeze_time", "hold_view", "time_and_view")
 
@@ -30,15 +24,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
 
 def results(workspace: Workspace) -> Path:
     return workspace.folder / "results" / "demo"
-
-
-def hashes(workspace: Workspace) -> dict[str, str]:
-    """Digest of every result; a checkpoint and a table that hold run times are none."""
-    return {
-        str(path.relative_to(results(workspace))): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(results(workspace).rglob("*"))
-        if path.suffix in (".png", ".mp4", ".json") or path.name in ("metrics.csv", "model.pt")
-    }
 
 
 def planned(workspace: Workspace, *arguments: str) -> set[str]:
@@ -137,30 +122,6 @@ def test_another_trajectory_runs_for_itself_only(finished: Workspace) -> None:
         "render_frames",
         "encode_film",
     }
-
-
-def test_killed_run_goes_on_and_ends_with_the_same_bytes(finished: Workspace, tmp_path: Path) -> None:
-    workspace = Workspace(tmp_path)
-    workspace.write_scene("demo", tiny_scene())
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(REPOSITORY / "Snakefile")]
-    command += ["--workflow-profile", "none", "--cores", "2", "render_all"]
-    for pause_s in (8.0, 14.0):
-        process = subprocess.Popen(
-            command,
-            cwd=workspace.folder,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-            env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
-        )
-        time.sleep(pause_s)
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        # A killed engine leaves its lock; it says so and how to take it away.
-        assert workspace.snakemake("--unlock").returncode == 0
-    result = workspace.snakemake("--cores", "2", "--rerun-incomplete", "render_all")
-    assert result.returncode == 0, result.stdout[-4000:]
-    assert hashes(workspace) == hashes(finished)
 
 
 def test_truncated_footage_stops_with_a_sentence_and_keeps_finished_work(
