@@ -13,6 +13,8 @@ folder=${2:?folder}
 mkdir -p "$folder"
 folder=$(cd "$folder" && pwd)
 node=$(hostname -s)
+# nproc counts the threads that OMP_NUM_THREADS allows, where that is set.
+cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc)
 
 # Waits for a command to succeed: daemons answer some time after they were started.
 wait_for() {
@@ -74,7 +76,7 @@ SlurmdPidFile=$folder/slurmd.own.pid
 KillWait=2
 MinJobAge=300
 ReturnToService=2
-NodeName=$node NodeAddr=127.0.0.1 CPUs=$(nproc) Gres=gpu:1 RealMemory=$(($(awk '/MemTotal/ {print $2}' /proc/meminfo) / 1024 / 2))
+NodeName=$node NodeAddr=127.0.0.1 CPUs=$cores Gres=gpu:1 RealMemory=$(($(awk '/MemTotal/ {print $2}' /proc/meminfo) / 1024 / 2))
 PartitionName=main Nodes=$node Default=YES MaxTime=INFINITE State=UP
 CONF
   # No GPU is needed to see that a job asks for one.

@@ -65,6 +65,15 @@ def submit(folder: Path, *targets: str) -> subprocess.Popen[str]:
     )
 
 
+def wait(process: subprocess.Popen[str]) -> str:
+    """What the engine said until it ended; it is not waited for for ever."""
+    try:
+        return process.communicate(timeout=600)[0]
+    except subprocess.TimeoutExpired:
+        process.kill()
+        pytest.fail(f"no end after ten minutes: {process.communicate()[0][-4000:]}")
+
+
 def said(output: str) -> str:
     return " ".join(output.split())
 
@@ -75,7 +84,7 @@ def test_results_are_those_of_a_local_run(slurm: None, tmp_path: Path) -> None:
     workspace.write_scene("demo", small_scene())
     write_profile(tmp_path)
     process = submit(tmp_path, "render_all")
-    output, _ = process.communicate(timeout=1800)
+    output = wait(process)
     assert process.returncode == 0, output[-4000:]
     print(f"{output.count('has been submitted')} submissions")
     assert digests(tmp_path) == digests(whole_run().folder)
@@ -89,7 +98,7 @@ def test_job_that_takes_too_much_memory_is_sent_again_with_more(slurm: None, tmp
     workspace.write_scene("demo", small_scene())
     write_profile(tmp_path, **{"default-resources": ["mem_mb=130 * attempt ** 3", "runtime=10"]})
     process = submit(tmp_path, "data/demo/frames/cam00")
-    output, _ = process.communicate(timeout=600)
+    output = wait(process)
     assert process.returncode == 0, output[-4000:]
     assert "Exceeded job memory limit" in said(output)
     assert "Trying to restart job" in said(output)
@@ -108,7 +117,7 @@ def test_cancelled_job_is_named_and_sent_again(slurm: None, tmp_path: Path) -> N
             break
         time.sleep(0.1)
     subprocess.run(["scancel", *numbers], check=True)
-    output, _ = process.communicate(timeout=600)
+    output = wait(process)
     assert process.returncode == 0, output[-4000:]
     assert f"JOB {numbers[0]} ON" in said(output) and "CANCELLED AT" in said(output)
     assert "Trying to restart job" in said(output)
