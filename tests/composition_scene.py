@@ -76,7 +76,7 @@ def are_equal(a, b):
 
 
 def command_line(sources, folder, options):
-    words = ["train", "--level", "0", "--num-levels", "1", "--threads", "1", "--device", "cpu"]
+    words = ["train", "--level", "0", "--num-levels", "1", "--device", "cpu"]
     words += ["--views", *map(str, sources.views), "--foreground", *map(str, sources.foreground)]
     words += ["--background", *map(str, sources.background), "--cameras", str(sources.cameras)]
     words += ["--films", *(f"{cam}={path}" for cam, path in sources.films.items())]

@@ -84,7 +84,7 @@ def finished(folder: Path) -> dict[Path, int]:
     return {
         path: path.stat().st_mtime_ns
         for path in made_files(folder)
-        if ".tmp" not in path.name
+        if not any(".tmp" in part for part in path.relative_to(folder).parts)
         and path.name != "checkpoint.pt"
         and not any(path == output or output in path.parents for output in open_outputs)
     }

