@@ -23,6 +23,7 @@ TINY = CompositionOptions(
     learning_rate=1e-3,
     warmup_steps=4,
     validation_samples=0,
+    num_threads=1,
     checkpoint_s=1e9,
 )
 

@@ -87,8 +87,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser.parse_args(argv)
     set_num_threads(1)
     # Stages report their progress; here only the table counts.
-    logging.getLogger("fourd").setLevel(logging.CRITICAL)
-    run(args.only, args.output)
+    logger = logging.getLogger("fourd")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        run(args.only, args.output)
+    finally:
+        logger.setLevel(level)
 
 
 if __name__ == "__main__":
