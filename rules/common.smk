@@ -15,6 +15,7 @@ from fourd.cli import flags_from_mapping
 from fourd.errors import InputError
 from fourd.plan.budget import describe_budget, fixed_keys, reduce_config
 from fourd.plan.files import read_survey
+from fourd.plan.marks import marked_outputs
 from fourd.plan.options import options_from_section
 from fourd.plan.outline import describe_scene
 from fourd.plan.work import OK, choose_work
@@ -44,6 +45,9 @@ except InputError as error:
 # Where results lie, for flags that name files: pathvars are filled in for inputs and outputs only.
 RESULTS = f"{config['pathvars'].get('results', 'results')}/{SCENE.name}"
 ASKED, ASKED_KEPT = config, KEPT
+
+# Left by an earlier run. A job's own process would see the marks of the run that it belongs to.
+UNFINISHED = marked_outputs(Path(".snakemake")) if workflow.is_main_process else set()
 
 
 def within_budget():
@@ -92,6 +96,8 @@ def work_to_do():
     path = Path(RESULTS) / "plan" / "survey.json"
     if is_run:
         path = checkpoints.survey.get(scene=SCENE.name).output[0]
+        # The engine looks for unfinished outputs before it knows the jobs that depend on the checkpoint.
+        workflow.dag.forcefiles.update(UNFINISHED)
     return read_work(str(path), Path(path).stat().st_mtime_ns if Path(path).is_file() else None)
 
 

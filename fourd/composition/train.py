@@ -160,6 +160,7 @@ def train(
     progress = Progress(total, counters["step"])
     started = time.monotonic() - counters["elapsed_s"]
     log_epoch = functools.partial(_log_row, trainer, samples, split, options, report)
+    num_rows = len(counters["rows"])
     if not counters["rows"] and counters["step"] == 0:
         # What the untrained network gives: without it nobody could tell what training added.
         counters["rows"].append(log_epoch(0))
@@ -179,10 +180,12 @@ def train(
             log.info("stopped by a signal at step %d of %d: run again to continue", step, total)
             raise SystemExit(128 + stop.signal_number)
     save(trainer)
-    unfinished = counters["step"] % len(training) != 0
-    if not unfinished:
-        return counters["rows"]
-    return [*counters["rows"], log_epoch(counters["step"] // len(training) + 1)]
+    if counters["step"] % len(training) != 0:
+        return [*counters["rows"], log_epoch(counters["step"] // len(training) + 1)]
+    if len(counters["rows"]) == num_rows:
+        # Trained to the end before: the log is known, but its picture may be gone.
+        log_epoch(counters["rows"][-1]["epoch"])
+    return counters["rows"]
 
 
 def train_step(

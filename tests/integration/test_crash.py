@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from fourd.io import read_json
+from fourd.plan.marks import marked_outputs
 from tests.conftest import REPOSITORY, Workspace
 from tests.small_event import digests, small_scene, whole_run
 
@@ -73,9 +74,7 @@ def made_files(folder: Path) -> Iterator[Path]:
 
 def unfinished(folder: Path) -> list[Path]:
     """Outputs that the engine knows to be unfinished."""
-    markers = folder / ".snakemake" / "incomplete"
-    names = (base64.b64decode(marker.name).decode() for marker in markers.glob("*"))
-    return [folder / name for name in names]
+    return [folder / name for name in marked_outputs(folder / ".snakemake")]
 
 
 def finished(folder: Path) -> dict[Path, int]:
@@ -123,6 +122,25 @@ def test_killed_at_random_moments_it_goes_on_and_ends_with_the_same_bytes(
     assert [path for path in (tmp_path / "results").rglob("*") if ".tmp" in path.name] == []
     # A mark alone is none: what a job of a killed run was to make for another need not be made again.
     assert [path for path in unfinished(tmp_path) if path.exists()] == []
+
+
+def test_output_that_was_not_registered_is_made_again(whole: Workspace, copied: Workspace) -> None:
+    """Killed after a file was in its place and before the engine noted with which settings it was made.
+
+    Of jobs behind the checkpoint the engine does not look at such marks by itself.
+    """
+    records = copied.folder / ".snakemake"
+    names = ["disparity/cam00-cam01/000000-000001.npz", "render/time_and_view/000000-000001"]
+    for output in (f"results/demo/{name}" for name in names):
+        mark = base64.urlsafe_b64encode(output.encode()).decode()
+        (records / "metadata" / mark).rename(records / "incomplete" / mark)
+        for path in [copied.folder / output, *(copied.folder / output).glob("*")]:
+            if path.is_file():
+                path.write_bytes(b"of other settings")
+    result = copied.snakemake("--cores", "2", "--rerun-incomplete", "render_all")
+    assert result.returncode == 0, result.stdout[-4000:]
+    assert digests(copied.folder) == digests(whole.folder)
+    assert unfinished(copied.folder) == []
 
 
 def test_second_run_on_the_same_results_refuses_politely(copied: Workspace) -> None:

@@ -187,6 +187,16 @@ def test_time_limit_stops_early_and_still_gives_a_model(sources, tmp_path):
     assert float(io.read_csv(tmp_path / "train.csv")[-1]["seconds"]) < 60
 
 
+def test_outputs_that_are_gone_come_back_from_a_finished_training(sources, tmp_path):
+    names = "model.pt", "train.csv", "validation.png"
+    train_model(sources, tmp_path)
+    before = [(tmp_path / name).read_bytes() for name in names]
+    for name in names:
+        (tmp_path / name).unlink()
+    train_model(sources, tmp_path)
+    assert [(tmp_path / name).read_bytes() for name in names] == before
+
+
 def test_log_has_a_row_per_epoch_with_every_column(sources, tmp_path):
     train_model(sources, tmp_path)
     rows = io.read_csv(tmp_path / "train.csv")
