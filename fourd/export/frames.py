@@ -1,9 +1,7 @@
 """Rendered films as frames for compositing: EXR with depth and provenance, or 16-bit PNG with depth.
 
-Depth is z along the optical axis in the calibration's units. Provenance says what a pixel rests on:
-0 nothing (the network's guess), 1 pairs of cameras at this instant, 2 the visual hull, 3 the static
-surface, 4 static surface continued into a hole. Source is the index of the camera whose colour weighs
-most, -1 where none does.
+Depth is z along the optical axis in the calibration's units; provenance and source are those of
+`fourd.provenance`.
 """
 
 import contextlib
@@ -19,45 +17,12 @@ from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.export.nerfstudio import write_png16
 from fourd.io import Archive, atomic_folder, read_image, write_json
+from fourd.provenance import BACKGROUND_KEYS, FOREGROUND_KEYS, NAMES, Provenance, find_provenance
 from fourd.render import BackgroundReader, list_frames, read_arrays
 from fourd.sfm.cameras import SceneCameras
 from fourd.views import View
 
-PROVENANCE = ("nothing", "pairs", "visual hull", "static surface", "filled")
-NO_SOURCE = 255
 CHANNELS = ("R", "G", "B", "Z", "provenance", "source")
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class RenderedFrame:
-    """A frame of a film and what is known of it.
-
-    rgb: (H, W, 3) uint8, display-referred;  depth: (H, W) float32, infinite where unknown
-    provenance: (H, W) uint8 index of PROVENANCE;  source: (H, W) int, -1 where no camera
-    """
-
-    rgb: np.ndarray
-    depth: np.ndarray
-    provenance: np.ndarray
-    source: np.ndarray
-
-
-def combine(
-    rgb: np.ndarray, foreground: Mapping[str, np.ndarray], background: Mapping[str, np.ndarray]
-) -> RenderedFrame:
-    """A rendered picture with the depth and the provenance of its estimates.
-
-    foreground: consensus_valid, depth, depth_source, source;  background: farthest_valid, depth, filled
-    """
-    near, far = foreground["consensus_valid"], background["farthest_valid"]
-    depth = np.where(near, foreground["depth"], np.where(far, background["depth"], np.inf))
-    static = np.where(background["filled"], 4, 3)
-    provenance = np.where(near, foreground["depth_source"], np.where(far, static, 0)).astype(np.uint8)
-    source = foreground["source"].astype(np.int32)
-    source = np.where(near & (source != NO_SOURCE), source, -1)
-    return RenderedFrame(
-        rgb, np.nan_to_num(depth, nan=np.inf, posinf=np.inf).astype(np.float32), provenance, source
-    )
 
 
 def linear_light(rgb: np.ndarray) -> np.ndarray:
@@ -97,13 +62,13 @@ def camera_attributes(camera: Camera) -> dict[str, Any]:
     }
 
 
-def write_exr(path: Path, frame: RenderedFrame, attributes: Mapping[str, Any]) -> None:
-    """Write an EXR: colour as half-float light, depth as float, provenance and source as half.
+def write_exr(path: Path, rgb: np.ndarray, found: Provenance, attributes: Mapping[str, Any]) -> None:
+    """Write an EXR: (H, W, 3) uint8 sRGB colour as half-float light, depth as float, the rest as half.
 
     Raises InputError if OpenImageIO is not installed or refuses.
     """
     oiio: Any = _open_image_io()
-    height, width = frame.depth.shape
+    height, width = found.depth.shape
     spec = oiio.ImageSpec(width, height, len(CHANNELS), oiio.FLOAT)
     spec.channelnames = CHANNELS
     spec.channelformats = tuple(oiio.FLOAT if name == "Z" else oiio.HALF for name in CHANNELS)
@@ -115,8 +80,8 @@ def write_exr(path: Path, frame: RenderedFrame, attributes: Mapping[str, Any]) -
             spec.attribute(name, oiio.TypeDesc("matrix"), tuple(value.ravel().tolist()))
         else:
             spec.attribute(name, value)
-    layers = [linear_light(frame.rgb), frame.depth[..., None]]
-    layers += [frame.provenance[..., None].astype(np.float32), frame.source[..., None].astype(np.float32)]
+    layers = [linear_light(rgb), found.depth[..., None]]
+    layers += [found.kind[..., None].astype(np.float32), found.source[..., None].astype(np.float32)]
     output: Any = oiio.ImageOutput.create(str(path))
     done = bool(output) and output.open(str(path), spec)
     done = done and output.write_image(np.ascontiguousarray(np.concatenate(layers, axis=2)))
@@ -169,7 +134,7 @@ def run_frames(
         archives = [stack.enter_context(contextlib.closing(Archive(path))) for path in estimates]
         near = [archive for archive in archives if "sample_frames" not in archive.meta]
         far_readers = [
-            BackgroundReader(archive, ("farthest_valid", "depth", "filled"))
+            BackgroundReader(archive, BACKGROUND_KEYS)
             for archive in archives
             if "sample_frames" in archive.meta
         ]
@@ -183,19 +148,19 @@ def run_frames(
                 raise InputError(
                     f"expected the estimates of frame {frame} of {view.name}, found none: fuse it again"
                 )
-            keys = ("consensus_valid", "depth", "depth_source", "source")
-            made = combine(read_image(path), read_arrays(archive, frame, keys), reader.read(frame))
-            made = dataclasses.replace(made, depth=made.depth * np.float32(unit))
+            rgb = read_image(path)
+            found = find_provenance(read_arrays(archive, frame, FOREGROUND_KEYS), reader.read(frame))
+            found = dataclasses.replace(found, depth=found.depth * np.float32(unit))
             entry = view.at(frame)
             center = (entry.camera.center * scene.scale + scene.origin) * scale
             camera = dataclasses.replace(entry.camera, t=-entry.camera.R @ center)
             if picture_format == "exr":
                 facts = {"fourd:sceneFrame": entry.scene_frame, "fourd:cameras": json.dumps(names)}
-                write_exr(folder / f"{frame:06d}.exr", made, {**camera_attributes(camera), **facts})
+                write_exr(folder / f"{frame:06d}.exr", rgb, found, {**camera_attributes(camera), **facts})
             else:
-                write_png16(folder / f"{frame:06d}.png", made.rgb[:, :, ::-1].astype(np.uint16) * 257)
-                steps = np.where(np.isfinite(made.depth), np.rint(made.depth / step), 0)
+                write_png16(folder / f"{frame:06d}.png", rgb[:, :, ::-1].astype(np.uint16) * 257)
+                steps = np.where(np.isfinite(found.depth), np.rint(found.depth / step), 0)
                 write_png16(folder / f"{frame:06d}_depth.png", np.minimum(steps, 65535).astype(np.uint16))
             frames.append({"frame": frame, "scene_frame": entry.scene_frame, **camera.to_dict()})
-        facts = {"view": view.name, "size": list(view.size), "cameras": names, "provenance": list(PROVENANCE)}
+        facts = {"view": view.name, "size": list(view.size), "cameras": names, "provenance": list(NAMES)}
         write_json(folder / "frames.json", {**facts, "depth_step": step, "frames": frames})

@@ -15,16 +15,13 @@ from typing import Any
 
 from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
 from fourd.errors import InputError
-from fourd.fuse.files import DisparityFiles, Pictures, Progress, Silhouettes
+from fourd.fuse.files import DisparityFiles, Pictures, Progress, Silhouettes, hull_depth_range
 from fourd.fuse.hull import HullOptions
 from fourd.fuse.options import ESTIMATES, FuseOptions
 from fourd.fuse.view import FusedView, choose_device, fuse_view
 from fourd.io import ArchiveWriter
 from fourd.sfm.cameras import read_cameras
 from fourd.views import read_view
-
-# Least depth that the hull is looked for at, as a share of the nearest that any camera films.
-CLOSER = 0.25
 
 log = logging.getLogger(__name__)
 
@@ -53,8 +50,6 @@ def run(
     disparities = DisparityFiles(disparity_paths, view.name)
     pictures = Pictures(films, scene, view.name)
     silhouettes = Silhouettes(silhouette_paths, view.name)
-    # A virtual camera may come closer to the scene than any other; a hull has no far end of its own.
-    depth_range = min(track.near for track in scene.tracks.values()) * CLOSER, float("inf")
     meta: dict[str, Any] = {
         "view": view.name,
         "cameras": list(pictures.names),
@@ -78,7 +73,7 @@ def run(
                 loaded = disparities.at(scene_frame, options.memory_mb), *pictures.at(scene_frame)
             fused = fuse_view(
                 entry.camera, *loaded, options, estimates, device=device,
-                silhouettes=silhouettes.at(entry.scene_frame), depth_range=depth_range,
+                silhouettes=silhouettes.at(entry.scene_frame), depth_range=hull_depth_range(scene),
                 hull_options=hull_options,
             )  # fmt: skip
             _write_frame(writer, frame, fused)

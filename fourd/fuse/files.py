@@ -19,6 +19,8 @@ log = logging.getLogger(__name__)
 
 # More open files than this are refused by common limits of 1024 per process.
 _OPEN_ARCHIVES = 256
+# A virtual camera may come closer to the scene than any that films; a share of the nearest of these.
+CLOSER = 0.25
 
 
 def read_pair_frame(archive: Archive, frame: int) -> PairFrame:
@@ -200,6 +202,11 @@ class Silhouettes:
     def close(self) -> None:
         for archive, _, _ in self._archives:
             archive.close()
+
+
+def hull_depth_range(scene: SceneCameras) -> tuple[float, float]:
+    """Depths that a hull is looked for at, world units: it has no far end of its own."""
+    return CLOSER * min(track.near for track in scene.tracks.values()), float("inf")
 
 
 class Progress:

@@ -12,6 +12,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from fourd.config import load_yaml
 from fourd.errors import InputError
 from fourd.io import atomic_path
 
@@ -23,7 +24,7 @@ MAX_FILM_BYTES = 4 * 2**30
 MIN_FREE_BYTES = 2 * 2**30
 BLOCK_BYTES = 2**20
 STEPS = re.compile(r"(\d+) of (\d+) steps")
-RULE = re.compile(r"^(?:local)?rule (\w+):", re.MULTILINE)
+RULE = re.compile(r"^(?:local)?(?:rule|checkpoint) (\w+):", re.MULTILINE)
 LAST_LINES = 40
 
 
@@ -65,6 +66,10 @@ def store_film(folder: Path, index: int, suffix: str, body: io.BufferedIOBase, n
     return path
 
 
+def _sources(scene_file: Path) -> list[str]:
+    return sorted(camera["source"] for camera in load_yaml(scene_file)["cameras"].values())
+
+
 class WorkflowJob:
     """One run of the workflow at a time: `python -m fourd.init` for films, then `snakemake viewer`.
 
@@ -81,13 +86,20 @@ class WorkflowJob:
     def films_folder(self, name: str) -> Path:
         return self._cwd / "data" / "uploads" / check_scene_name(name)
 
-    def start(self, name: str, is_synchronized: bool = False) -> None:
-        """Run on the films of a scene. Raises InputError while another runs, or for too few films."""
+    def start(self, name: str, num_films: int, is_synchronized: bool = False) -> None:
+        """Run on the films of a scene, or go on with a run on them that was cancelled.
+
+        num_films: how many were sent for it
+        Raises InputError while another runs, for too few films, or for a scene that is made of others.
+        """
         films = sorted(self.films_folder(name).glob("cam*.*"))
-        if len(films) < 2:
-            raise InputError(f"scene {name}: expected at least 2 films, got {len(films)}: drop more videos")
-        if (self._cwd / "config" / "scenes" / f"{name}.yaml").exists():
-            raise InputError(f"scene {name}: there is one of this name already: choose another name")
+        if num_films < 2:
+            raise InputError(f"scene {name}: expected at least 2 films, got {num_films}: drop more videos")
+        paths = [str(film.relative_to(self._cwd)) for film in films]
+        scene_file = self._cwd / "config" / "scenes" / f"{name}.yaml"
+        is_known = scene_file.exists()
+        if len(films) != num_films or (is_known and _sources(scene_file) != paths):
+            raise InputError(f"scene {name}: there is one of other films already: choose another name")
         with self._lock:
             if self.state["status"] == "running":
                 raise InputError(
@@ -101,13 +113,14 @@ class WorkflowJob:
                 "total": 0,
                 "step": "looking at the films",
             }
-        paths = [str(film.relative_to(self._cwd)) for film in films]
         init = [sys.executable, "-m", "fourd.init", name, *paths]
         init += ["--synchronized"] if is_synchronized else []
         make = [sys.executable, "-m", "snakemake", "--cores", str(self._cores), "viewer"]
         make += ["--config", f"scene={name}", "--workflow-profile", "none", "--scheduler", "greedy"]
         make += ["--rerun-incomplete", *self._arguments]
-        threading.Thread(target=self._run, args=(name, [init, make]), daemon=True).start()
+        threading.Thread(
+            target=self._run, args=(name, [make] if is_known else [init, make]), daemon=True
+        ).start()
 
     def _run(self, name: str, commands: list[list[str]]) -> None:
         lines: list[str] = []

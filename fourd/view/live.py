@@ -18,7 +18,7 @@ from fourd.background.estimate import estimate_backgrounds
 from fourd.composition import CascadeOptions
 from fourd.errors import InputError
 from fourd.fuse import FuseOptions
-from fourd.fuse.files import DisparityFiles, Pictures, Progress, Silhouettes
+from fourd.fuse.files import DisparityFiles, Pictures, Progress, Silhouettes, hull_depth_range
 from fourd.fuse.hull import HullOptions
 from fourd.fuse.view import fuse_view
 from fourd.sfm.cameras import read_cameras
@@ -28,7 +28,8 @@ from fourd.viewer.lattice import fit_width
 # Backgrounds of so many places are kept: turning back to one is quick.
 MAX_BACKGROUNDS = 24
 MIN_WIDTH, MAX_WIDTH = 64, 1280
-CLOSER = 0.25
+# As the workflow reads it: below the scene's settings stand the defaults, above them this file.
+CONFIG_FILE = Path("config/config.yaml")
 
 
 class Cancelled(Exception):
@@ -48,7 +49,8 @@ class LiveScene:
 
         folder = results / name
         scene_file, settings = fourd_config.load_scene(name)
-        config = fourd_config.load_config({}, settings, name)
+        given = fourd_config.load_yaml(CONFIG_FILE) if CONFIG_FILE.is_file() else {}
+        config = fourd_config.load_config(given, settings, name)
         self.scene = read_cameras(folder / "sfm" / "cameras.json")
         disparities = sorted((folder / "disparity").glob("*/*.npz"))
         if not any(path.stem != "samples" for path in disparities):
@@ -95,7 +97,7 @@ class LiveScene:
             self.fuse_options,
             device=self.device,
             silhouettes=self.silhouettes.at(frame),
-            depth_range=(min(track.near for track in self.scene.tracks.values()) * CLOSER, float("inf")),
+            depth_range=hull_depth_range(self.scene),
             hull_options=self.hull_options,
         )
         tell("composition", 0.8)

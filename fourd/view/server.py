@@ -119,7 +119,10 @@ class Handler(BaseHTTPRequestHandler):
 
     def _post(self, path: str, query: dict[str, str]) -> None:
         if path == "/api/run":
-            self.server.job.start(check_scene_name(query.get("scene", "")), query.get("synchronized") == "1")
+            name, count = check_scene_name(query.get("scene", "")), query.get("films", "")
+            if not count.isdecimal():
+                raise InputError("expected the number of films: ask again")
+            self.server.job.start(name, int(count), query.get("synchronized") == "1")
         elif path == "/api/cancel":
             self.server.job.cancel()
         else:

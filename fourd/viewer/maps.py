@@ -8,14 +8,21 @@ import numpy as np
 
 from fourd.errors import InputError
 from fourd.io import Archive, ArchiveWriter
+from fourd.provenance import (
+    BACKGROUND_KEYS,
+    CONTINUED,
+    FOREGROUND_KEYS,
+    HULL,
+    NOTHING,
+    STATIC,
+    find_provenance,
+)
 from fourd.render import BackgroundReader, read_arrays
 from fourd.viewer.lattice import MAP_REDUCTION
 
-# Origins; a colour from camera i of the fused ones is FIRST_CAMERA + i.
-NOTHING, STATIC, CONTINUED, HULL, FIRST_CAMERA = 0, 1, 2, 3, 4
-FOREGROUND_KEYS = ("consensus_valid", "depth", "source", "depth_source")
-BACKGROUND_KEYS = ("farthest_valid", "depth", "filled")
-HULL_DEPTH = 2
+# The page's numbers; a colour from camera i of the fused ones is FIRST_CAMERA + i.
+ORIGINS = {NOTHING: 0, STATIC: 1, CONTINUED: 2, HULL: 3}
+FIRST_CAMERA = len(ORIGINS)
 
 
 def map_origins(
@@ -26,18 +33,13 @@ def map_origins(
     foreground, background: arrays of one frame of these archives (docs/formats.md)
     Every MAP_REDUCTION-th pixel, not a mean: a mean of two surfaces is a place where nothing is.
     """
-    start = MAP_REDUCTION // 2
-    front = {key: foreground[key][start::MAP_REDUCTION, start::MAP_REDUCTION] for key in FOREGROUND_KEYS}
-    back = {key: background[key][start::MAP_REDUCTION, start::MAP_REDUCTION] for key in BACKGROUND_KEYS}
-    seen = front["consensus_valid"] & (front["source"] != 255)
-    depth = np.where(seen, front["depth"], back["depth"]).astype(np.float32)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse_depth = np.nan_to_num(1 / depth, nan=0.0, posinf=0.0, neginf=0.0)
-    origin = np.where(back["farthest_valid"], STATIC, NOTHING)
-    origin = np.where(back["filled"], CONTINUED, origin)
-    origin = np.where(seen, FIRST_CAMERA + front["source"].astype(np.int32), origin)
-    origin = np.where(seen & (front["depth_source"] == HULL_DEPTH), HULL, origin)
-    return inverse_depth, origin.astype(np.uint8)
+    some = np.s_[MAP_REDUCTION // 2 :: MAP_REDUCTION, MAP_REDUCTION // 2 :: MAP_REDUCTION]
+    front = {key: foreground[key][some] for key in FOREGROUND_KEYS}
+    found = find_provenance(front, {key: background[key][some] for key in BACKGROUND_KEYS})
+    origin = FIRST_CAMERA + found.source
+    for kind, number in ORIGINS.items():
+        origin[found.kind == kind] = number
+    return np.where(found.depth > 0, 1 / found.depth, 0).astype(np.float32), origin.astype(np.uint8)
 
 
 def write_maps(foreground_path: Path, background_path: Path, output: Path) -> None:

@@ -15,13 +15,13 @@ from fourd.export.event import Event
 from fourd.export.formats import write_format
 from fourd.export.frames import (
     camera_attributes,
-    combine,
     linear_light,
     read_exr,
     run_frames,
     write_exr,
 )
 from fourd.io import ArchiveWriter, read_json, write_png
+from fourd.provenance import CONTINUED, NOTHING, PAIRS, STATIC, find_provenance
 from tests.unit.export_event import (
     NUM_FRAMES,
     ORIGIN,
@@ -138,23 +138,24 @@ def estimates(shape=(4, 6)):
 
 
 def test_provenance_says_what_a_pixel_rests_on() -> None:
-    frame = combine(np.zeros((4, 6, 3), np.uint8), *estimates())
-    assert frame.provenance[:, 0].tolist() == [1] * 4 and frame.provenance[:, 5].tolist() == [0, 4, 3, 3]
-    assert frame.source[0].tolist() == [4, 4, 4, -1, -1, -1]
-    assert frame.depth[2].tolist() == [2, 2, 2, 5, 5, 5] and np.isinf(frame.depth[0, 5])
+    found = find_provenance(*estimates())
+    kinds = [NOTHING, CONTINUED, STATIC, STATIC]
+    assert found.kind[:, 0].tolist() == [PAIRS] * 4 and found.kind[:, 5].tolist() == kinds
+    assert found.source[0].tolist() == [4, 4, 4, -1, -1, -1]
+    assert found.depth[2].tolist() == [2, 2, 2, 5, 5, 5] and np.isinf(found.depth[0, 5])
 
 
 def test_exr_holds_light_depth_and_the_camera(tmp_path: Path) -> None:
     pytest.importorskip("OpenImageIO", reason="the extra exr has it")
     rgb = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
-    frame = combine(rgb, *estimates())
+    found = find_provenance(*estimates())
     camera = source_camera(make_scene(), "cam00", 0)
-    write_exr(tmp_path / "a.exr", frame, camera_attributes(camera))
+    write_exr(tmp_path / "a.exr", rgb, found, camera_attributes(camera))
     channels, document = read_exr(tmp_path / "a.exr")
     assert set(channels) == {"R", "G", "B", "Z", "provenance", "source"}
-    assert np.array_equal(channels["Z"], frame.depth)
-    assert np.array_equal(channels["provenance"], frame.provenance)
-    assert np.array_equal(channels["source"], frame.source)
+    assert np.array_equal(channels["Z"], found.depth)
+    assert np.array_equal(channels["provenance"], found.kind)
+    assert np.array_equal(channels["source"], found.source)
     light = np.stack([channels[c] for c in "RGB"], axis=-1)
     display = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0) ** (1 / 2.4) - 0.055)
     assert np.abs(255 * display - rgb).max() < 0.2

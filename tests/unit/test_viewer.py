@@ -15,11 +15,12 @@ from PIL import Image
 
 from fourd.errors import InputError
 from fourd.geometry import look_at
+from fourd.provenance import CONTINUED, HULL, NOTHING, STATIC
 from fourd.viewer import ViewerOptions
 from fourd.viewer.__main__ import main
 from fourd.viewer.lattice import bytes_of, choose_lattice, fit_width
 from fourd.viewer.manifest import describe_scene, thin_points
-from fourd.viewer.maps import CONTINUED, FIRST_CAMERA, HULL, NOTHING, STATIC, map_origins, write_maps
+from fourd.viewer.maps import FIRST_CAMERA, ORIGINS, map_origins, write_maps
 from fourd.viewer.pack import RUN_LENGTH, encode_map, encode_within, pack_runs
 from fourd.viewer.page import ASSETS, SHELL, draw_page, find_nearest
 from tests.conftest import REPOSITORY
@@ -103,7 +104,8 @@ def estimates() -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
 
 def test_origins_and_depths_of_every_kind() -> None:
     inverse_depth, origin = map_origins(*estimates())
-    assert origin.tolist() == [[NOTHING, STATIC, CONTINUED, HULL, FIRST_CAMERA, FIRST_CAMERA + 6]]
+    numbers = [ORIGINS[kind] for kind in (NOTHING, STATIC, CONTINUED, HULL)]
+    assert origin.tolist() == [[*numbers, FIRST_CAMERA, FIRST_CAMERA + 6]]
     np.testing.assert_allclose(inverse_depth, [[0, 0.25, 0, 0.5, 0.5, 0.5]])
 
 

@@ -138,12 +138,12 @@ def wait_for(job: WorkflowJob) -> dict:
 def test_run_needs_films_and_says_what_went_wrong(workspace: Workspace) -> None:
     job = WorkflowJob(workspace.folder, 1)
     with pytest.raises(InputError, match="expected at least 2 films, got 0"):
-        job.start("party")
+        job.start("party", 0)
     for index in range(2):
         store_film(job.films_folder("party"), index, "mp4", io.BufferedReader(io.BytesIO(b"no film")), 7)
-    job.start("party")
+    job.start("party", 2)
     with pytest.raises(InputError, match="expected one run at a time"):
-        job.start("party")
+        job.start("party", 2)
     state = wait_for(job)
     assert state["status"] == "failed"
     assert any("cam00.mp4" in line for line in state["words"])
@@ -156,20 +156,28 @@ def test_run_goes_through_scene_file_and_workflow(workspace: Workspace) -> None:
     folder.mkdir(parents=True)
     for index in range(2):
         write_video(folder / f"cam{index:02d}.mp4", constant_ticks(12))
-    job.start("party", is_synchronized=True)
+    job.start("party", 2, is_synchronized=True)
     state = wait_for(job)
     assert state["status"] == "done", state
     assert state["address"] == "/scenes/party/"
     assert (workspace.folder / "config" / "scenes" / "party.yaml").is_file()
-    with pytest.raises(InputError, match="there is one of this name already"):
-        job.start("party")
+    scene_file = workspace.folder / "config" / "scenes" / "party.yaml"
+    written = scene_file.stat().st_mtime_ns
+    job.start("party", 2)
+    assert wait_for(job)["status"] == "done", "the same films go on"
+    assert scene_file.stat().st_mtime_ns == written
+    with pytest.raises(InputError, match="there is one of other films already"):
+        job.start("party", 3)
+    write_video(folder / "cam02.mp4", constant_ticks(12))
+    with pytest.raises(InputError, match="there is one of other films already"):
+        job.start("party", 3)
 
 
 def test_progress_is_read_from_the_workflow_and_a_run_can_be_cancelled(workspace: Workspace) -> None:
     snakefile = workspace.folder / "Snakefile"
     snakefile.write_text(
         "rule viewer:\n    input: 'b'\n"
-        "rule b:\n    input: 'a'\n    output: 'b'\n    shell: 'sleep 60; touch b'\n"
+        "checkpoint b:\n    input: 'a'\n    output: 'b'\n    shell: 'sleep 60; touch b'\n"
         "rule a:\n    output: 'a'\n    shell: 'touch a'\n"
     )
     job = WorkflowJob(workspace.folder, 1, ("--nolock",))
@@ -177,11 +185,13 @@ def test_progress_is_read_from_the_workflow_and_a_run_can_be_cancelled(workspace
     folder.mkdir(parents=True)
     for index in range(2):
         write_video(folder / f"cam{index:02d}.mp4", constant_ticks(12))
-    job.start("party", is_synchronized=True)
+    job.start("party", 2, is_synchronized=True)
     end = time.monotonic() + 100
     while job.state.get("step") != "b" and job.state["status"] == "running" and time.monotonic() < end:
         time.sleep(0.1)
     assert (job.state["step"], job.state["done"], job.state["total"]) == ("b", 1, 3), job.state
+    with pytest.raises(InputError, match="expected one run at a time"):
+        job.start("party", 2)
     start = time.monotonic()
     job.cancel()
     assert wait_for(job)["status"] == "cancelled"

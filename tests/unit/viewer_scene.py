@@ -9,10 +9,11 @@ import numpy as np
 from fourd import io, views
 from fourd.camera import Camera, CameraTrack
 from fourd.geometry import look_at
+from fourd.provenance import HULL, STATIC
 from fourd.sfm import SceneCameras, write_cameras
 from fourd.trajectory import trajectory_from_mapping
 from fourd.viewer.lattice import MAP_REDUCTION
-from fourd.viewer.maps import FIRST_CAMERA, HULL, STATIC
+from fourd.viewer.maps import FIRST_CAMERA, ORIGINS
 from tests.films import put_on_clock
 from tests.unit.sfm_rig import make_texture, render_planes
 
@@ -124,8 +125,8 @@ def _write_pictures(lattice: Path, view: views.View) -> None:
             picture = render(entry.camera, entry.scene_frame)
             io.write_png(lattice / "render" / view.name / CHUNK / f"{entry.frame:06d}.png", picture)
             depth, is_board = depth_at(entry.camera, entry.scene_frame)
-            origin = np.where(is_board, FIRST_CAMERA, STATIC)
-            origin[:20] = HULL
+            origin = np.where(is_board, FIRST_CAMERA, ORIGINS[STATIC])
+            origin[:20] = ORIGINS[HULL]
             small = (slice(1, None, MAP_REDUCTION), slice(1, None, MAP_REDUCTION))
             inverse = np.nan_to_num(1 / depth[small])
             writer.add_frame(entry.frame, inverse_depth=inverse, origin=origin[small].astype(np.uint8))
