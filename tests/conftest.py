@@ -1,6 +1,7 @@
 """Paths and helpers shared by the tests."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ import yaml
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
+ENGINE = [sys.executable, "-m", "snakemake", "--snakefile", str(REPOSITORY / "Snakefile")]
+ENGINE += ["--workflow-profile", "none"]
 
 
 @pytest.fixture
@@ -37,10 +40,8 @@ class Workspace:
 
     def snakemake(self, *arguments: str, timeout_s: float = 600) -> subprocess.CompletedProcess[str]:
         """Run snakemake here; standard output and error come back joined."""
-        command = [sys.executable, "-m", "snakemake", "--snakefile", str(REPOSITORY / "Snakefile")]
-        command += ["--workflow-profile", "none", "--scheduler", "greedy", *arguments]
         return subprocess.run(
-            command,
+            [*ENGINE, "--scheduler", "greedy", *arguments],
             cwd=self.folder,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -48,6 +49,18 @@ class Workspace:
             timeout=timeout_s,
             env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
         )
+
+    def planned(self, target: str, *arguments: str) -> dict[str, int]:
+        """Rules that a dry run of a target would run, and how often; the target itself is not counted."""
+        output = self.snakemake(target, "-n", "--quiet", "rules", "host", *arguments).stdout
+        return {} if "Nothing to be done" in output else job_counts(output, target)
+
+
+def job_counts(output: str, *but: str) -> dict[str, int]:
+    """Rule -> number of jobs, from the table that a dry run prints, without the rules named."""
+    table = output.split("Job stats:")[1].split("total")[0]
+    rows = re.findall(r"^(\w+)\s+(\d+)$", table, re.MULTILINE)
+    return {rule: int(count) for rule, count in rows if rule not in but}
 
 
 @pytest.fixture

@@ -17,12 +17,10 @@ import pytest
 
 from fourd.io import read_json
 from fourd.plan.marks import marked_outputs
-from tests.conftest import REPOSITORY, Workspace
+from tests.conftest import ENGINE, REPOSITORY, Workspace
 from tests.small_event import digests, small_scene, whole_run
 
 KILLS = 20
-ENGINE = [sys.executable, "-m", "snakemake", "--snakefile", str(REPOSITORY / "Snakefile")]
-ENGINE += ["--workflow-profile", "none", "--scheduler", "greedy", "--rerun-incomplete"]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +40,7 @@ def copied(whole: Workspace, tmp_path: Path) -> Workspace:
 def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     """The engine in a process group of its own, its output to be read line by line."""
     return subprocess.Popen(
-        [*ENGINE, "--cores", "2", *arguments],
+        [*ENGINE, "--scheduler", "greedy", "--rerun-incomplete", "--cores", "2", *arguments],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

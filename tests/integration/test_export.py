@@ -1,6 +1,5 @@
 """Films along stated paths, and the scene for other programs, called as a user calls them."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -37,17 +36,6 @@ def results(workspace: Workspace) -> Path:
     return workspace.folder / "results" / "demo"
 
 
-def planned(workspace: Workspace, *arguments: str) -> dict[str, int]:
-    """Rules that a dry run would run, and how often."""
-    output = workspace.snakemake("render_all", "-n", "--quiet", "rules", "host", *arguments).stdout
-    if "Nothing to be done" in output:
-        return {}
-    table = output.split("Job stats:")[1].split("total")[0]
-    counts = {rule: int(count) for rule, count in re.findall(r"^(\w+)\s+(\d+)$", table, re.MULTILINE)}
-    counts.pop("render_all")
-    return counts
-
-
 def test_films_are_as_their_paths_state(finished: Workspace) -> None:
     folder = results(finished) / "render"
     sizes = {"deep": ((192, 54), 2), "deep_right": ((96, 54), 2), "own": ((80, 46), 4)}
@@ -71,17 +59,19 @@ def test_eyes_of_a_stereo_film_stand_side_by_side(finished: Workspace) -> None:
 
 
 def test_another_path_renders_its_own_views_only(finished: Workspace) -> None:
-    assert planned(finished) == {}
+    assert finished.planned("render_all") == {}
     path = finished.folder / "path.json"
     write_json(path, {**PATH_FILE, "turn_deg": 10})
     try:
-        changed = planned(finished)
+        changed = finished.planned("render_all")
     finally:
         write_json(path, PATH_FILE)
     # Four frames in two chunks.
     one_view = {"place_view": 1, "fuse_foreground": 2, "estimate_background": 2, "render_frames": 2}
     assert changed == {**one_view, "encode_film": 1, "encode_master": 1}
-    assert planned(finished, "--config", "film={codec: hevc, master: ffv1, fps: 15}") == {"encode_film": 3}
+    assert finished.planned("render_all", "--config", "film={codec: hevc, master: ffv1, fps: 15}") == {
+        "encode_film": 3
+    }
 
 
 def test_every_format_is_there_with_all_frames(finished: Workspace) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,35 +10,28 @@ import pytest
 from fourd.io import read_image
 from fourd.view.live import LiveScene
 from tests.conftest import Workspace, tiny_scene
-from tests.workflow.test_job_graph import job_counts
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
-def save_path(page_file: Path, output: Path) -> None:
+def save_path(browser, page_file: Path, output: Path) -> None:
     """A path of two key frames, taken in the browser."""
-    program = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if program is None:
-        pytest.skip(f"needs a browser: none of {', '.join(BROWSERS)} is installed")
-    driver = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
-    with driver.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        page = browser.new_page()
-        page.goto(page_file.as_uri() + "#t=0&v=0.25")
-        page.wait_for_function("document.getElementById('picture').dataset.exact === 'true'")
-        page.click("#add-key")
-        page.evaluate("location.hash = '#t=5&v=0.75'")
-        page.wait_for_function("document.getElementById('view').value === '0.75'")
-        page.click("#add-key")
-        page.fill("#keys input", "0.2")
-        page.press("#keys input", "Enter")
-        with page.expect_download() as download:
-            page.click("#save-path")
-        download.value.save_as(output)
-        browser.close()
+    page = browser.new_page()
+    page.goto(page_file.as_uri() + "#t=0&v=0.25")
+    page.wait_for_function("document.getElementById('picture').dataset.exact === 'true'")
+    page.click("#add-key")
+    page.evaluate("location.hash = '#t=5&v=0.75'")
+    page.wait_for_function("document.getElementById('view').value === '0.75'")
+    page.click("#add-key")
+    page.fill("#keys input", "0.2")
+    page.press("#keys input", "Enter")
+    with page.expect_download() as download:
+        page.click("#save-path")
+    download.value.save_as(output)
+    page.close()
 
 
-def test_page_live_view_and_saved_film(workspace: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_live_view_and_saved_film(
+    workspace: Workspace, browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = tiny_scene(num_cameras=4)
     scene["settings"] |= {"chunk_frames": 6, "viewer": {"num_views": 3}}
     workspace.write_scene("demo", scene)
@@ -49,12 +41,8 @@ def test_page_live_view_and_saved_film(workspace: Workspace, monkeypatch: pytest
     log = (workspace.folder / "logs" / "demo" / "viewer_page.log").read_text()
     assert "6 moments of 3 views" in log
     assert not list((folder / "lattice" / "foreground").glob("*/*.npz")), "estimates of the lattice stay"
-    again = workspace.snakemake("viewer", "-n", "--quiet", "rules", "host")
-    assert "Nothing to be done" in again.stdout
-    changed = workspace.snakemake(
-        "viewer", "-n", "--quiet", "rules", "host", "--config", "viewer={quality: 60}"
-    )
-    assert set(job_counts(changed.stdout)) == {"viewer_page", "viewer"}
+    assert workspace.planned("viewer") == {}
+    assert set(workspace.planned("viewer", "--config", "viewer={quality: 60}")) == {"viewer_page"}
 
     monkeypatch.chdir(workspace.folder)
     live = LiveScene("demo", Path("results"))
@@ -65,7 +53,7 @@ def test_page_live_view_and_saved_film(workspace: Workspace, monkeypatch: pytest
     assert np.abs(image.astype(int) - rendered).mean() < 2
 
     path = workspace.folder / "saved.json"
-    save_path(folder / "viewer" / "index.html", path)
+    save_path(browser, folder / "viewer" / "index.html", path)
     assert json.loads(path.read_text())["num_frames"] == 6
     film = os.path.join("results", "demo", "render", "mine.mp4")
     made = workspace.snakemake(

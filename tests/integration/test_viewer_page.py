@@ -16,24 +16,10 @@ from fourd.viewer.__main__ import main
 from tests.unit import viewer_scene
 from tests.unit.viewer_scene import FRAMES, NUM_FRAMES, NUM_VIEWS, SIZE, cross_fade, psnr_db
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 READY = "document.getElementById('picture').dataset.exact === 'true'"
 LOADED = "document.getElementById('status').textContent.includes('moments from')"
 # A browser that draws without a graphics card says so as a warning when its picture is taken.
 DRIVER = "GPU stall due to ReadPixels"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator:
-    program = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if program is None:
-        pytest.skip(f"needs a browser: none of {', '.join(BROWSERS)} is installed")
-    driver = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
-    with driver.sync_playwright() as playwright:
-        # Without the sandbox a browser starts as root too, as in containers; it opens own files only.
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
