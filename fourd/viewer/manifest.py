@@ -9,6 +9,7 @@ import numpy as np
 
 from fourd.camera import Camera, CameraTrack
 from fourd.io import SCHEMA_VERSION, Archive
+from fourd.paths.hull import describe_view
 from fourd.sfm.cameras import SceneCameras
 from fourd.trajectory import TrajectorySpec, place_cameras
 from fourd.viewer.lattice import REAL_SHARE
@@ -39,6 +40,7 @@ def describe_scene(
     """
     frames = [entry.scene_frame for entry in views[0].frames]
     middle = np.mean([track.at(0).center for track in scene.tracks.values()], axis=0)
+    way = way_between(scene, len(views), views[0].size)
     return {
         "schema_version": SCHEMA_VERSION,
         "scene": name,
@@ -57,7 +59,8 @@ def describe_scene(
             }
             for i, view in enumerate(views)
         ],
-        "way": [_pose(camera) for camera in way_between(scene, len(views), views[0].size)],
+        "way": [_pose(camera) for camera in way],
+        "outside": find_outside(way, scene, frames),
         "cameras": [
             _describe_camera(track, name in scene.heldout, frames, width)
             for name, track in scene.tracks.items()
@@ -71,6 +74,15 @@ def way_between(scene: SceneCameras, num_views: int, size: tuple[int, int]) -> l
     shares = np.linspace(0, 1, POSES_PER_GAP * (num_views - 1) + 1)
     held = [TrajectorySpec(kind="hold", position=float(share), num_frames=1) for share in shares]
     return [place_cameras(spec, scene, size)[0] for spec in held]
+
+
+def find_outside(way: Sequence[Camera], scene: SceneCameras, frames: Sequence[int]) -> list[list[int]]:
+    """For every pose the moments, counted from 0, at which it is no view that the cameras can know."""
+    at_moments = [[scene.tracks[name].at(frame) for name in scene.inputs] for frame in frames]
+    return [
+        [i for i, inputs in enumerate(at_moments) if describe_view(camera, inputs)["is_outside"]]
+        for camera in way
+    ]
 
 
 def _describe_camera(

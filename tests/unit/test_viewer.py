@@ -1,6 +1,7 @@
 """The page's parts: what is rendered for it, how it is packed, what it says."""
 
 import base64
+import dataclasses
 import io
 import json
 import shutil
@@ -19,7 +20,7 @@ from fourd.provenance import CONTINUED, HULL, NOTHING, STATIC
 from fourd.viewer import ViewerOptions
 from fourd.viewer.__main__ import main
 from fourd.viewer.lattice import bytes_of, choose_lattice, fit_width
-from fourd.viewer.manifest import describe_scene, thin_points
+from fourd.viewer.manifest import describe_scene, find_outside, thin_points
 from fourd.viewer.maps import FIRST_CAMERA, ORIGINS, map_origins, write_maps
 from fourd.viewer.pack import RUN_LENGTH, encode_map, encode_within, pack_runs
 from fourd.viewer.page import ASSETS, SHELL, draw_page, find_nearest
@@ -185,6 +186,16 @@ def test_manifest_places_points_where_the_cameras_do() -> None:
     cameras = {camera["name"]: camera for camera in manifest["cameras"]}
     assert [cameras[name]["is_heldout"] for name in viewer_scene.NAMES] == [False, True, False]
     assert cameras["cam00"]["picture"] == [128, 72]
+
+
+def test_places_that_no_camera_can_know_are_named() -> None:
+    scene = viewer_scene.make_scene()
+    inside = scene.tracks["cam00"].at(0)
+    away = dataclasses.replace(inside, t=inside.t + inside.R @ np.array([0.0, 100.0, 0.0]))
+    back = dataclasses.replace(inside, R=np.diag([-1.0, 1.0, -1.0]) @ inside.R, t=inside.t)
+    frames = list(viewer_scene.FRAMES)
+    everywhen = list(range(len(frames)))
+    assert find_outside([inside, away, back], scene, frames) == [[], everywhen, everywhen]
 
 
 def test_far_points_are_left_out_and_many_thinned() -> None:

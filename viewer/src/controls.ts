@@ -5,6 +5,7 @@ import { centerOf, dot, length, subtract } from "./geometry";
 import { formatLink, readLink } from "./link";
 import { legendOf } from "./overlay";
 import { element, make } from "./page";
+import { isOutside } from "./path";
 import { type Overlay, SPEEDS, type State, orbit, seek, stepMoment, togglePlay } from "./state";
 
 // The address bar is written at most this often; browsers stop pages that write it on every frame.
@@ -48,7 +49,8 @@ export function connectControls(app: App): void {
     const seconds = `${(app.frame / manifest.fps).toFixed(2)} s`;
     element("time-text").textContent = `${seconds}, ${frame.replace("frame ", "").replace(" of ", "/")}`;
     time.setAttribute("aria-valuetext", `${seconds}, ${frame}`);
-    const place = describePlace(app);
+    const outside = isOutside(manifest, state.share, app.moment) ? ", outside the cameras" : "";
+    const place = describePlace(app) + outside;
     element("view-text").textContent = place;
     view.setAttribute("aria-valuetext", place);
     showLegend(app, state);

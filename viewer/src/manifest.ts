@@ -35,6 +35,8 @@ export interface Manifest {
   views: LatticeView[];
   /** Poses of the films' path, evenly from the first view to the last. */
   way: Pose[];
+  /** For every pose of the way, the moments at which the cameras cannot know what it shows. */
+  outside: number[][];
   cameras: RealCamera[];
   points: number[][];
   files: string[];

@@ -5,7 +5,7 @@ import { centerOf, nearestView } from "./geometry";
 import { momentOfFrame, poseAt } from "./manifest";
 import { type MapView, drawMap } from "./map";
 import { element, make, save } from "./page";
-import { type Path, durationOf, exportPath, pathAt, tidyPath } from "./path";
+import { type Path, durationOf, exportPath, isOutside, pathAt, tidyPath } from "./path";
 import { clamp, orbit } from "./state";
 
 const TURN = 0.15;
@@ -158,7 +158,9 @@ export function connectPath(app: App): void {
 function drawKey(app: App, path: Path, at: number, update: (path: Path) => void): HTMLLIElement {
   const key = path.keys[at]!;
   const change = (keys: Path["keys"]): void => update({ ...path, keys });
-  const words = `frame ${key.frame + 1}, view ${Math.round(100 * key.share)} %`;
+  const moment = momentOfFrame(app.manifest.frames, key.frame);
+  const outside = isOutside(app.manifest, key.share, moment) ? ", outside the cameras" : "";
+  const words = `frame ${key.frame + 1}, view ${Math.round(100 * key.share)} %${outside}`;
   const button = (text: string, label: string, action: () => void): HTMLButtonElement => {
     const made = make("button", {
       type: "button",
@@ -189,7 +191,7 @@ function drawKey(app: App, path: Path, at: number, update: (path: Path) => void)
       app.change((s) => ({
         ...s,
         share: key.share,
-        clock: momentOfFrame(app.manifest.frames, key.frame),
+        clock: moment,
         isPlaying: false,
       })),
     ),

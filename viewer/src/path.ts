@@ -51,6 +51,11 @@ export function poseOfShare({ way }: Pick<Manifest, "way">, share: number): Pose
   return weight ? interpolatePose(way, first, weight) : way[first]!;
 }
 
+/** Whether a place of the path lies outside what the cameras can know, at a moment. */
+export function isOutside({ outside }: Pick<Manifest, "outside">, share: number, moment: number): boolean {
+  return outside[Math.round(share * (outside.length - 1))]!.includes(moment);
+}
+
 const round = (value: number): number => Number(value.toFixed(DIGITS));
 
 /** The trajectory that `render_all` takes (docs/paths.md): poses and moments by their place in the film. */

@@ -11,7 +11,7 @@ import {
   depthColour,
   legendOf,
 } from "../src/overlay";
-import { type Path, durationOf, exportPath, pathAt, poseOfShare, tidyPath } from "../src/path";
+import { type Path, durationOf, exportPath, isOutside, pathAt, poseOfShare, tidyPath } from "../src/path";
 import { makeManifest } from "./scene";
 
 const manifest = makeManifest();
@@ -62,6 +62,15 @@ describe("paths", () => {
   it("start with their first key, whatever was removed", () => {
     const tidy = tidyPath({ ...path, keys: path.keys.slice(1) });
     expect(tidy.keys.map((key) => key.seconds)).toEqual([0, 1]);
+  });
+});
+
+describe("places", () => {
+  it("outside the cameras are known by pose and moment", () => {
+    const scene = makeManifest();
+    const last = scene.frames.length - 1;
+    expect([0, 0.5, 1].map((share) => isOutside(scene, share, last))).toEqual([false, false, true]);
+    expect(isOutside(scene, 1, 0)).toBe(false);
   });
 });
 

@@ -39,6 +39,8 @@ export function makeManifest(numViews = 5, frames = [0, 2, 4, 6, 8, 10]): Manife
     fused: ["cam00", "cam02"],
     views,
     way,
+    // The second half of the way, at the last moment.
+    outside: way.map((_, i) => (i > way.length / 2 ? [frames.length - 1] : [])),
     cameras,
     points: [[0, 0, 0]],
     files: [...files, ...cameras.map(({ name }) => `camera-${name}-0.js`)],
