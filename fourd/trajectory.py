@@ -2,24 +2,21 @@
 
 A trajectory has two independent halves: where the view is (`kind` and its keys), and which frame of
 the event is shown (`time`). Paths run through the input cameras' mean places, so the shake of
-hand-held cameras does not enter. The keys are told in docs/paths.md.
+hand-held cameras does not enter. The keys are told in docs/paths.md; the poses are placed by
+`fourd.paths.presets`, so that the job graph, which needs the frames only, loads nothing of geometry.
 """
 
 import dataclasses
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
-from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.paths.checks import check_keys, check_numbers, check_points
 from fourd.paths.timing import check_time, frames_of_keys
-
-if TYPE_CHECKING:
-    from fourd.sfm.cameras import SceneCameras
 
 DEFAULT_TRAJECTORIES: dict[str, dict[str, Any]] = {
     "freeze_time": {"kind": "arc", "time": "frozen"},
@@ -187,17 +184,3 @@ def scene_frames(spec: TrajectorySpec | Mapping[str, Any], num_frames: int) -> l
         return [(4 * last * min(i, end - i) + end) // (2 * end) for i in range(length)]
     frames = [(2 * i * last + length - 1) // (2 * (length - 1)) for i in range(length)]
     return frames[::-1] if spec.time == "reversed" else frames
-
-
-def place_cameras(spec: TrajectorySpec, scene_cameras: "SceneCameras", size: tuple[int, int]) -> list[Camera]:
-    """The ideal pinhole of every frame of the film.
-
-    size: of the film, (width, height) px; pixels are square, the principal point is central (but for
-    the eyes of a stereo film) and, unless stated, the field of view over the diagonal is interpolated
-    from the neighbouring cameras'
-    Raises InputError when the cameras or the keys do not make the path.
-    """
-    # SciPy takes 0.3 s to import, and the workflow's every start needs `scene_frames` only.
-    from fourd.paths.presets import place_film
-
-    return place_film(spec, scene_cameras, scene_frames(spec, scene_cameras.num_frames), size)

@@ -20,7 +20,7 @@ from fourd.cli import run_stage
 from fourd.errors import InputError
 from fourd.io import SCHEMA_VERSION, read_json, write_json
 from fourd.sfm.cameras import SceneCameras, read_cameras
-from fourd.trajectory import TrajectorySpec, place_cameras, scene_frames, trajectory_from_mapping
+from fourd.trajectory import TrajectorySpec, scene_frames, trajectory_from_mapping
 
 STAGE_VERSION = 1
 logger = logging.getLogger(__name__)
@@ -126,6 +126,9 @@ def virtual_view(scene: SceneCameras, name: str, spec: TrajectorySpec, size: tup
     if name in scene.tracks:
         raise InputError(f"trajectory {name}: a camera has this name already: choose another")
     size = scene.tracks[scene.inputs[0]].size if size is None else size
+    # SciPy takes 0.3 s to import, and most readers of views place none.
+    from fourd.paths.presets import place_cameras
+
     shown = scene_frames(spec, scene.num_frames)
     cameras = place_cameras(spec, scene, size)
     entries = tuple(

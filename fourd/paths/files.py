@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 from fourd.camera import Camera, check_camera
 from fourd.errors import InputError
 from fourd.io import atomic_folder, read_csv, read_json, write_csv, write_json, write_text
-from fourd.paths.presets import focal_of_fov, fov_of_focal
+from fourd.paths.presets import focal_of_fov, fov_of_focal, place_cameras
 from fourd.paths.timing import film_shares
 from fourd.sfm.cameras import SceneCameras
 from fourd.sfm.importers.colmap import PIXEL_CENTER, read_colmap
 from fourd.sfm.importers.nerfstudio import OPENCV_FROM_OPENGL
-from fourd.trajectory import place_cameras, read_path_file, scene_frames, trajectory_from_mapping
+from fourd.trajectory import read_path_file, scene_frames, trajectory_from_mapping
 from fourd.views import View
 
 FORMATS = ("path", "nerfstudio", "colmap", "csv")

@@ -28,7 +28,7 @@ from fourd.errors import InputError
 from fourd.geometry import look_at
 from fourd.paths.spline import PoseSpline, even_places, smooth_progress
 from fourd.paths.timing import EASINGS, film_shares, locate
-from fourd.trajectory import TrajectorySpec, bullet_moment
+from fourd.trajectory import TrajectorySpec, bullet_moment, scene_frames
 
 if TYPE_CHECKING:
     from fourd.sfm.cameras import SceneCameras
@@ -37,10 +37,15 @@ if TYPE_CHECKING:
 WIDEST_GAP_OF_RING_DEG = 100.0
 
 
-def place_film(
-    spec: TrajectorySpec, scene: "SceneCameras", shown: Sequence[int], size: tuple[int, int]
-) -> list[Camera]:
-    """One pinhole per frame of the film. shown: scene frame of each. Raises InputError."""
+def place_cameras(spec: TrajectorySpec, scene: "SceneCameras", size: tuple[int, int]) -> list[Camera]:
+    """The ideal pinhole of every frame of the film.
+
+    size: of the film, (width, height) px; pixels are square, the principal point is central (but for
+    the eyes of a stereo film) and, unless stated, the field of view over the diagonal is interpolated
+    from the neighbouring cameras'
+    Raises InputError when the cameras or the keys do not make the path.
+    """
+    shown = scene_frames(spec, scene.num_frames)
     film = _PLACES[spec.kind](spec, scene, shown, size)
     if spec.look_at is not None and spec.kind != "follow":
         points = look_points(spec, scene, shown)

@@ -15,7 +15,8 @@ from fourd.camera import Camera, CameraTrack, check_camera
 from fourd.config import fill_defaults, validate
 from fourd.errors import InputError
 from fourd.geometry import angle_deg, look_at
-from fourd.trajectory import TrajectorySpec, place_cameras, scene_frames, trajectory_from_mapping
+from fourd.paths.presets import place_cameras
+from fourd.trajectory import TrajectorySpec, scene_frames, trajectory_from_mapping
 
 SCHEMA = Path(__file__).resolve().parents[2] / "config" / "schemas" / "trajectories.schema.yaml"
 UP = np.array([0.0, 0.0, 1.0])

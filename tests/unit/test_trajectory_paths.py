@@ -12,11 +12,10 @@ from fourd.errors import InputError
 from fourd.geometry import angle_deg
 from fourd.io import write_json
 from fourd.paths.hull import describe_path, describe_view, distance_to_hull
-from fourd.paths.presets import focal_of_fov, fov_of_focal
+from fourd.paths.presets import focal_of_fov, fov_of_focal, place_cameras
 from fourd.paths.spline import PoseSpline, even_places, smooth_progress
 from fourd.trajectory import (
     TrajectorySpec,
-    place_cameras,
     resolve_trajectories,
     scene_frames,
     trajectory_from_mapping,
