@@ -3,7 +3,10 @@
 import argparse
 import dataclasses
 import errno
+import os
 import shlex
+import subprocess
+import sys
 
 import pytest
 from hypothesis import given
@@ -11,6 +14,7 @@ from hypothesis import strategies as st
 
 from fourd import cli
 from fourd.errors import InputError
+from tests.conftest import REPOSITORY
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,3 +81,18 @@ def test_programming_errors_are_not_swallowed() -> None:
 
     with pytest.raises(KeyError):
         cli.run_stage(main)
+
+
+@pytest.mark.parametrize(("asked", "expected"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "active"}, "ACTIVE")])
+def test_threads_of_torch_wait_without_spinning_unless_told(asked: dict[str, str], expected: str) -> None:
+    """As the loaded OpenMP itself says it."""
+    environment = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}
+    result = subprocess.run(
+        [sys.executable, "-c", "import fourd.composition.model"],
+        cwd=REPOSITORY,
+        env={**environment, **asked, "OMP_DISPLAY_ENV": "true"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert f"OMP_WAIT_POLICY = '{expected}'" in result.stderr
