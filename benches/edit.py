@@ -1,6 +1,6 @@
 """Error and time of edits: masks through one film, and through all cameras and times of the demo event.
 
-    python -m benches.edit --output DIR [--clips DIR] [--event DIR --scene NAME]
+    python -m benches.edit --output DIR [--clips DIR] [--event DIR --scene NAME [--sweep grow_px ...]]
 
 CLIPS holds JPEGImages/CLIP/*.jpg and Annotations/CLIP/*.png (0 = background) of every frame: each clip is
 marked on its first frame only. EVENT is a folder in which `edit_all` has edited cam04 of the demo with its
@@ -11,6 +11,7 @@ per edit and step, and a picture of each.
 
 import argparse
 import contextlib
+import dataclasses
 import os
 import resource
 import time
@@ -53,6 +54,7 @@ EDITS = {
     "behind_2": ("cam04", 5, (1, 2), "see_behind", 2),
 }
 VIEW = "cam04"
+SWEEPS = {"grow_px": (0.0, 1.5, 3.0), "feather_px": (0.0, 1.0, 2.0), "num_times": (3, 6, 12)}
 LABEL_OF_MARK = {"man": 1, "woman": 2, "behind_1": 1, "behind_2": 1}
 
 
@@ -95,7 +97,7 @@ def bench_clip(folder: Path, clip: str, output: Path) -> dict[str, Any]:
     images = [io.read_image(path) for path in paths]
     row: dict[str, Any] = {"experiment": "one film", "subject": clip}
     with measured(row):
-        found = list(follow_mask(iter(images), truths[0]))
+        found = follow_mask(images, truths[0])
     scores = [(jaccard(m, t), boundary_score(m, t)) for m, t in zip(found[1:], truths[1:], strict=True)]
     row["jaccard"], row["boundary"] = (round(float(v), 3) for v in np.mean(scores, axis=0))
     row["error"] = round(1 - (row["jaccard"] + row["boundary"]) / 2, 3)
@@ -157,14 +159,19 @@ class Event:
         return FrozenScene(time_s, self.demo).trace(view)[0], view
 
 
-def bench_masks(event: Event, name: str, options: EditOptions) -> tuple[dict[str, Any], Edit]:
-    """Carry a box to all cameras and frames. Error is 1 - mean IoU where it shows; times are per frame."""
-    camera, frame, labels, operation, order = EDITS[name]
+def mark_edit(event: Event, name: str) -> Edit:
+    """An edit marked by a box around its figure."""
+    camera, frame, _, operation, order = EDITS[name]
     y, x = np.nonzero(event.label(camera, frame) == LABEL_OF_MARK[name])
     corners = (float(x.min() - 3), float(y.min() - 3)), (float(x.max() + 3), float(y.max() + 3))
-    edit = Edit(name, "demo", operation, order, (VIEW,), (Mark(camera, frame, "box", corners),))
-    row: dict[str, Any] = {"experiment": "masks", "subject": name}
-    path = event.output / f"masks_{name}.npz"
+    return Edit(name, "demo", operation, order, (VIEW,), (Mark(camera, frame, "box", corners),))
+
+
+def bench_masks(event: Event, edit: Edit, options: EditOptions) -> dict[str, Any]:
+    """Carry a box to all cameras and frames. Error is 1 - mean IoU where it shows; times are per frame."""
+    labels = EDITS[edit.name][2]
+    row: dict[str, Any] = {"experiment": "masks", "subject": edit.name}
+    path = event.output / f"masks_{edit.name}.npz"
     with measured(row):
         masks.run(edit, event.results / "sfm/cameras.json", event.films, event.depths, [], options, path)
     archive = io.Archive(path)
@@ -176,8 +183,17 @@ def bench_masks(event: Event, name: str, options: EditOptions) -> tuple[dict[str
                 scores.append(jaccard(archive[f"{f:06d}/{cam}"] > 0, truth))
     row["jaccard"] = round(float(np.mean(scores)), 3)
     row["error"] = round(1 - row["jaccard"], 3)
-    row |= {key: round(row[key] / event.scene.num_frames, 3) for key in ("seconds", "cpu_seconds")}
-    return row, edit
+    return row | {key: round(row[key] / event.scene.num_frames, 3) for key in ("seconds", "cpu_seconds")}
+
+
+def sweep_option(event: Event, key: str, frames: Sequence[int]) -> Iterator[dict[str, Any]]:
+    """Rows of the man's edit with other settings. Soft edges leave masks as they are."""
+    edit = mark_edit(event, "man")
+    for value in SWEEPS[key]:
+        options = dataclasses.replace(EditOptions(), **{key: value})
+        if key == "num_times" or not (event.output / "masks_man.npz").is_file():
+            yield bench_masks(event, edit, options) | {"subject": f"man, {key} {value}"}
+        yield bench_view(event, edit, options, frames) | {"subject": f"man, {key} {value}"}
 
 
 def bench_view(event: Event, edit: Edit, options: EditOptions, frames: Sequence[int]) -> dict[str, Any]:
@@ -267,6 +283,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--event", type=Path, help="folder in which the demo was made")
     parser.add_argument("--scene", default="demo_known")
     parser.add_argument("--edits", nargs="*", choices=list(EDITS), default=list(EDITS))
+    parser.add_argument("--sweep", nargs="*", choices=list(SWEEPS), default=[], help="settings to vary")
     parser.add_argument("--frames", type=int, nargs="*", default=list(range(3, 27)))
     args = parser.parse_args(argv)
     cli.set_num_threads(1)
@@ -286,9 +303,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         os.chdir(args.event)
         event, options = Event(Path(), args.scene, output), EditOptions()
         for name in args.edits:
-            row, edit = bench_masks(event, name, options)
-            add(lambda row=row: row)
+            edit = mark_edit(event, name)
+            add(lambda edit=edit: bench_masks(event, edit, options))
             add(lambda edit=edit: bench_view(event, edit, options, args.frames))
+        for key in args.sweep:
+            for row in sweep_option(event, key, args.frames):
+                add(lambda row=row: row)
 
 
 if __name__ == "__main__":

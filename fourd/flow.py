@@ -138,7 +138,8 @@ def _flow_at(
     Returns (H, W, 2) float32 px from first to second, and (H, W) bool where it is to be used.
     """
     first, second = pictures
-    forward, backward = _dense_flows(first, second, options.max_flow_width_px)
+    forward = dense_flow(first, second, options.max_flow_width_px)
+    backward = dense_flow(second, first, options.max_flow_width_px)
     flow = np.zeros_like(forward)
     moved = np.zeros(inside.shape, bool)
     best = still_cost - _STILL_MARGIN
@@ -161,27 +162,31 @@ def _smooth_outline(flow: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np
     return np.where((smooth & ~moved)[..., None], around, flow), smooth
 
 
-def _dense_flows(first: np.ndarray, second: np.ndarray, max_width_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 2) float32 flow, px, from the first picture to the second and back.
+def dense_flow(
+    first: np.ndarray, second: np.ndarray, max_width_px: int | None = None, finest_scale: int = 0
+) -> np.ndarray:
+    """(H, W, 2) float32 flow, px, from the first picture to the second.
 
+    first, second: (H, W, 3) uint8 RGB of one size
+    max_width_px: wider pictures are halved until they fit, None for never
+    finest_scale: of the pyramid that is searched, 0 is the picture itself and 1 half of it
     Source: T. Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016.
     """
     grays = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (first, second)]
     height, width = grays[0].shape
     step = 1
-    while width > step * max_width_px and min(height, width) >= 64 * step:
+    while max_width_px is not None and width > step * max_width_px and min(height, width) >= 64 * step:
         step *= 2
     if step > 1:
         small = (width // step, height // step)
         grays = [cv2.resize(gray, small, interpolation=cv2.INTER_AREA) for gray in grays]
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    method.setFinestScale(0)
-    flows = []
-    for a, b in (grays, grays[::-1]):
-        flow = np.asarray(method.calc(a, b, None))  # type: ignore[call-overload]
-        scale = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
-        flows.append(cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR) * scale)
-    return flows[0], flows[1]
+    method.setFinestScale(finest_scale)
+    flow = np.asarray(method.calc(grays[0], grays[1], None))  # type: ignore[call-overload]
+    if step == 1:
+        return flow
+    scale = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
+    return cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR) * scale
 
 
 def _sample(picture: np.ndarray, flow: np.ndarray) -> np.ndarray:

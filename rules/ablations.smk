@@ -18,25 +18,25 @@ ABLATIONS = [
 
 rule ablations:
     input:
-        cameras=f"<results>/{SCENE.name}/sfm/cameras.json",
-        films=expand(f"<results>/{SCENE.name}/frames/cameras/{{cam}}.npz", cam=SCENE.cameras),
-        views=expand(f"<results>/{SCENE.name}/views/{{cam}}.json", cam=SCENE.cameras),
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.cameras),
+        views=expand("<results>/<scene>/views/{cam}.json", cam=SCENE.cameras),
         foreground=training_foregrounds(),
         background=training_backgrounds(),
         heldout=[
-            f"<results>/{SCENE.name}/{kind}/{cam}/{chunk}.npz"
+            f"<results>/<scene>/{kind}/{cam}/{chunk}.npz"
             for kind in ("foreground", "background")
             for cam in SCENE.heldout
             for chunk in chunks_of_view(cam)
         ],
         labels=[f"{SCENE.labels}/{cam}" for cam in SCENE.heldout] if SCENE.labels else [],
     output:
-        table=f"<results>/{SCENE.name}/ablations/composition.csv",
-        picture=f"<results>/{SCENE.name}/ablations/composition.png",
+        table="<results>/<scene>/ablations/composition.csv",
+        picture="<results>/<scene>/ablations/composition.png",
     log:
-        f"<logs>/{SCENE.name}/ablations.log",
+        "<logs>/<scene>/ablations.log",
     benchmark:
-        f"<benchmarks>/{SCENE.name}/ablations.tsv"
+        "<benchmarks>/<scene>/ablations.tsv"
     conda:
         "../envs/torch.yaml"
     threads: 1

@@ -1,6 +1,6 @@
 """One clock for all cameras: what is heard, what is seen to move, and every film on that clock."""
 
-INGEST_OF_ALL = expand("<results>/{{scene}}/ingest/{cam}.json", cam=SCENE.cameras)
+INGEST_OF_ALL = expand("<results>/<scene>/ingest/{cam}.json", cam=SCENE.cameras)
 # Which cameras there are, which of them are held out, and what is to be filmed of the common clock.
 CLOCK_FLAGS = flags_from_mapping(
     {
@@ -17,12 +17,12 @@ rule listen:
     input:
         ingest=INGEST_OF_ALL,
     output:
-        offsets="<results>/{scene}/align/audio.json",
-        evidence="<results>/{scene}/align/audio.png",
+        offsets="<results>/<scene>/align/audio.json",
+        evidence="<results>/<scene>/align/audio.png",
     log:
-        "<logs>/{scene}/listen.log",
+        "<logs>/<scene>/listen.log",
     benchmark:
-        "<benchmarks>/{scene}/listen.tsv"
+        "<benchmarks>/<scene>/listen.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -37,16 +37,16 @@ rule listen:
 
 rule track_motion:
     input:
-        ingest="<results>/{scene}/ingest/{cam}.json",
-        audio="<results>/{scene}/align/audio.json",
-        cameras="<results>/{scene}/sfm/film_cameras.json",
+        ingest="<results>/<scene>/ingest/{cam}.json",
+        audio="<results>/<scene>/align/audio.json",
+        cameras="<results>/<scene>/sfm/film_cameras.json",
     output:
-        tracks="<results>/{scene}/align/tracks/{cam}.npz",
-        maps="<results>/{scene}/align/maps/{cam}.npz",
+        tracks="<results>/<scene>/align/tracks/{cam}.npz",
+        maps="<results>/<scene>/align/maps/{cam}.npz",
     log:
-        "<logs>/{scene}/track_motion/{cam}.log",
+        "<logs>/<scene>/track_motion/{cam}.log",
     benchmark:
-        "<benchmarks>/{scene}/track_motion/{cam}.tsv"
+        "<benchmarks>/<scene>/track_motion/{cam}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -63,17 +63,17 @@ rule track_motion:
 rule align_cameras:
     input:
         ingest=INGEST_OF_ALL,
-        audio="<results>/{scene}/align/audio.json",
-        cameras="<results>/{scene}/sfm/film_cameras.json",
-        tracks=expand("<results>/{{scene}}/align/tracks/{cam}.npz", cam=SCENE.cameras),
-        maps=expand("<results>/{{scene}}/align/maps/{cam}.npz", cam=SCENE.cameras),
+        audio="<results>/<scene>/align/audio.json",
+        cameras="<results>/<scene>/sfm/film_cameras.json",
+        tracks=expand("<results>/<scene>/align/tracks/{cam}.npz", cam=SCENE.cameras),
+        maps=expand("<results>/<scene>/align/maps/{cam}.npz", cam=SCENE.cameras),
     output:
-        offsets="<results>/{scene}/align/offsets.json",
-        evidence="<results>/{scene}/align/offsets.png",
+        offsets="<results>/<scene>/align/offsets.json",
+        evidence="<results>/<scene>/align/offsets.png",
     log:
-        "<logs>/{scene}/align_cameras.log",
+        "<logs>/<scene>/align_cameras.log",
     benchmark:
-        "<benchmarks>/{scene}/align_cameras.tsv"
+        "<benchmarks>/<scene>/align_cameras.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -89,14 +89,14 @@ rule align_cameras:
 
 rule sample_camera:
     input:
-        ingest="<results>/{scene}/ingest/{cam}.json",
-        offsets=[] if SCENE.clock_is_given else "<results>/{scene}/align/offsets.json",
+        ingest="<results>/<scene>/ingest/{cam}.json",
+        offsets=[] if SCENE.clock_is_given else "<results>/<scene>/align/offsets.json",
     output:
-        "<results>/{scene}/align/cameras/{cam}.json",
+        "<results>/<scene>/align/cameras/{cam}.json",
     log:
-        "<logs>/{scene}/sample_camera/{cam}.log",
+        "<logs>/<scene>/sample_camera/{cam}.log",
     benchmark:
-        "<benchmarks>/{scene}/sample_camera/{cam}.tsv"
+        "<benchmarks>/<scene>/sample_camera/{cam}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1

@@ -3,17 +3,17 @@
 
 rule estimate_background:
     input:
-        view="<results>/{scene}/views/{view}.json",
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        view="<results>/<scene>/views/{view}.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=sample_disparities,
-        survey=ancient("<results>/{scene}/plan/survey.json"),
+        survey=ancient("<results>/<scene>/plan/survey.json"),
     output:
-        intermediate("foreground", "<results>/{scene}/background/{view}/{chunk}.npz"),
+        intermediate("foreground", "<results>/<scene>/background/{view}/{chunk}.npz"),
     log:
-        "<logs>/{scene}/estimate_background/{view}/{chunk}.log",
+        "<logs>/<scene>/estimate_background/{view}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/estimate_background/{view}/{chunk}.tsv"
+        "<benchmarks>/<scene>/estimate_background/{view}/{chunk}.tsv"
     priority: 10
     conda:
         "../envs/torch.yaml"

@@ -1,6 +1,7 @@
 """Checked configuration, the lists that span the job graph, and helper functions of the rules."""
 
 import functools
+import gc
 import json
 import os
 import sys
@@ -21,6 +22,9 @@ from fourd.plan.outline import describe_scene
 from fourd.plan.work import OK, choose_work
 from fourd.sources import check_sources, source_stamp
 from fourd.trajectory import resolve_trajectories
+
+# A job graph is many objects that live to the end: looking for garbage among them took a sixth of a dry run.
+gc.set_threshold(100_000, 10, 10)
 
 MADE_BY_RULES = ("data/demo/", "data/pose2sim/")
 
@@ -45,6 +49,11 @@ except InputError as error:
 # Where results lie, for flags that name files: pathvars are filled in for inputs and outputs only.
 RESULTS = f"{config['pathvars'].get('results', 'results')}/{SCENE.name}"
 ASKED, ASKED_KEPT = config, KEPT
+
+
+pathvars:
+    scene=SCENE.name,
+
 
 # Left by an earlier run. A job's own process would see the marks of the run that it belongs to.
 UNFINISHED = marked_outputs(Path(".snakemake")) if workflow.is_main_process else set()
@@ -95,7 +104,7 @@ def work_to_do():
     is_run = workflow.executor_plugin is not None and not workflow.dryrun
     path = Path(RESULTS) / "plan" / "survey.json"
     if is_run:
-        path = checkpoints.survey.get(scene=SCENE.name).output[0]
+        path = checkpoints.survey.get().output[0]
         # The engine looks for unfinished outputs before it knows the jobs that depend on the checkpoint.
         workflow.dag.forcefiles.update(UNFINISHED)
     return read_work(str(path), Path(path).stat().st_mtime_ns if Path(path).is_file() else None)
@@ -131,7 +140,9 @@ def plan_flags():
     settings, reduction = within_budget()
     kept = reduction.kept if reduction else KEPT
     outline = describe_scene(SCENE, settings, VIEW_FRAMES, kept)
-    flags = {"outline": outline, "budget": describe_budget(ASKED, reduction)}
+    lattice = {"views": list(LATTICE.views), "num_moments": len(LATTICE.frames)}
+    lattice |= {"size": LATTICE.size, "size_mb": LATTICE.forecast_mb}
+    flags = {"outline": outline, "lattice": lattice, "budget": describe_budget(ASKED, reduction)}
     words = {flag: json.dumps(value, sort_keys=True) for flag, value in flags.items()}
     return flags_from_mapping(words | settings["plan"])
 
@@ -195,8 +206,8 @@ def film_cameras_command():
 def films_of_pair(wildcards):
     left, right = wildcards.pair.split("-")
     return {
-        "left": f"<results>/{wildcards.scene}/frames/cameras/{left}.npz",
-        "right": f"<results>/{wildcards.scene}/frames/cameras/{right}.npz",
+        "left": f"<results>/<scene>/frames/cameras/{left}.npz",
+        "right": f"<results>/<scene>/frames/cameras/{right}.npz",
     }
 
 
@@ -209,8 +220,7 @@ def disparity_frames(wildcards):
 def disparities_at(view, chunks):
     """Disparities that the foreground of a view is made from, none where nothing moves."""
     return expand(
-        "<results>/{scene}/disparity/{pair}/{chunk}.npz",
-        scene=SCENE.name,
+        "<results>/<scene>/disparity/{pair}/{chunk}.npz",
         pair=pairs_without(view) if work_to_do().foreground == OK else [],
         chunk=chunks,
     )
@@ -220,8 +230,7 @@ def silhouettes_at(chunks):
     work = work_to_do()
     is_made = work.foreground == OK and work.silhouettes == OK
     return expand(
-        "<results>/{scene}/silhouettes/{chunk}.npz",
-        scene=SCENE.name,
+        "<results>/<scene>/silhouettes/{chunk}.npz",
         chunk=chunks if is_made else [],
     )
 
@@ -237,9 +246,7 @@ def silhouettes_of_view(wildcards):
 def empty_scene_of(wildcards):
     """The facts of a camera's film of the empty scene, where there is one."""
     has_one = SCENE.cameras[wildcards.cam].background
-    return (
-        [f"<results>/{wildcards.scene}/ingest/background/{wildcards.cam}.json"] if has_one else []
-    )
+    return [f"<results>/<scene>/ingest/background/{wildcards.cam}.json"] if has_one else []
 
 
 def empty_scene_flags(wildcards):
@@ -259,15 +266,14 @@ def estimates_of_view(wildcards):
 
 def sample_disparities(wildcards):
     return expand(
-        "<results>/{scene}/disparity/{pair}/samples.npz",
-        scene=wildcards.scene,
+        "<results>/<scene>/disparity/{pair}/samples.npz",
         pair=pairs_without(wildcards.view),
     )
 
 
 def training_foregrounds():
     return [
-        f"<results>/{SCENE.name}/foreground/{cam}/{chunk}.npz"
+        f"<results>/<scene>/foreground/{cam}/{chunk}.npz"
         for cam in SCENE.inputs
         for chunk in chunks_of_view(cam)
     ]
@@ -280,15 +286,13 @@ def training_backgrounds():
         frames = sorted(VIEW_FRAMES[cam])
         for first in range(0, len(frames), CHUNK_FRAMES):
             last = frames[min(first + CHUNK_FRAMES, len(frames)) - 1]
-            groups.append(
-                f"<results>/{SCENE.name}/background/{cam}/{frames[first]:06d}-{last:06d}.npz"
-            )
+            groups.append(f"<results>/<scene>/background/{cam}/{frames[first]:06d}-{last:06d}.npz")
     return groups
 
 
 def evaluated(stage, suffix=""):
     return lambda wildcards: [
-        f"<results>/{wildcards.scene}/{stage}/{wildcards.cam}/{chunk}{suffix}"
+        f"<results>/<scene>/{stage}/{wildcards.cam}/{chunk}{suffix}"
         for chunk in chunks_of_view(wildcards.cam)
     ]
 
@@ -306,12 +310,10 @@ def folders_of_film(wildcards):
     name = wildcards.trajectory
     is_stereo = TRAJECTORIES[name].get("eye") == "left" and f"{name}_right" in TRAJECTORIES
     views = {"frames": [name], "right": [f"{name}_right"] if is_stereo else []}
-    folder = "<results>/{scene}/render/{view}/{chunk}"
+    folder = "<results>/<scene>/render/{view}/{chunk}"
     return {
         key: [
-            path
-            for view in names
-            for path in expand(folder, scene=wildcards.scene, view=view, chunk=chunks_of_view(view))
+            path for view in names for path in expand(folder, view=view, chunk=chunks_of_view(view))
         ]
         for key, names in views.items()
     }
@@ -327,13 +329,10 @@ def chunks_shown(frames, chunk):
     return sorted({CHUNKS[frame // CHUNK_FRAMES] for frame in shown})
 
 
-FILMS = expand(
-    "<results>/{scene}/render/{trajectory}.mp4", scene=SCENE.name, trajectory=TRAJECTORIES
-)
+FILMS = expand("<results>/<scene>/render/{trajectory}.mp4", trajectory=TRAJECTORIES)
 EVALUATION = (
     expand(
-        "<results>/{scene}/evaluate/{file}",
-        scene=SCENE.name,
+        "<results>/<scene>/evaluate/{file}",
         file=["metrics.csv", "table.md", "contact_sheet.png"],
     )
     if SCENE.heldout
@@ -384,7 +383,6 @@ def print_finished():
 
 
 wildcard_constraints:
-    scene=SCENE.name,
     cam="|".join(SCENE.cameras),
     view="|".join([*SCENE.cameras, *TRAJECTORIES]),
     trajectory="|".join(TRAJECTORIES) or "none",

@@ -3,19 +3,19 @@
 
 rule train_level:
     input:
-        views=expand("<results>/{{scene}}/views/{cam}.json", cam=SCENE.inputs),
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        views=expand("<results>/<scene>/views/{cam}.json", cam=SCENE.inputs),
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         foreground=training_foregrounds(),
         background=training_backgrounds(),
     output:
-        model="<results>/{scene}/composition/{level}/model.pt",
-        table="<results>/{scene}/composition/{level}/train.csv",
-        picture="<results>/{scene}/composition/{level}/validation.png",
+        model="<results>/<scene>/composition/{level}/model.pt",
+        table="<results>/<scene>/composition/{level}/train.csv",
+        picture="<results>/<scene>/composition/{level}/validation.png",
     log:
-        "<logs>/{scene}/train_level/{level}.log",
+        "<logs>/<scene>/train_level/{level}.log",
     benchmark:
-        "<benchmarks>/{scene}/train_level/{level}.tsv"
+        "<benchmarks>/<scene>/train_level/{level}.tsv"
     conda:
         "../envs/torch.yaml"
     threads: config["composition"]["num_threads"]

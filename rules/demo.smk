@@ -87,6 +87,24 @@ rule demo_phone_labels:
         " {params.options} 2> {log}"
 
 
+rule demo_phone_depths:
+    output:
+        directory("data/demo/truth/phone_depths/{demo_cam}"),
+    log:
+        "<logs>/demo/demo_phone_depths/{demo_cam}.log",
+    benchmark:
+        "<benchmarks>/demo/demo_phone_depths/{demo_cam}.tsv"
+    conda:
+        "../envs/vision.yaml"
+    threads: 1
+    params:
+        options=DEMO_FLAGS,
+        version=fourd_config.stage_version("demo"),
+    shell:
+        "python -m fourd.demo depths --of-phone --name {wildcards.demo_cam} --output {output}"
+        " {params.options} 2> {log}"
+
+
 rule demo_phone:
     output:
         "data/demo/phones/{demo_cam}.mp4",

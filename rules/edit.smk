@@ -6,15 +6,15 @@ include: "edit_common.smk"
 
 rule edit_depths:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=disparities_of_depths,
     output:
-        intermediate("foreground", "<results>/{scene}/edit/depth/{chunk}.npz"),
+        intermediate("foreground", "<results>/<scene>/edit/depth/{chunk}.npz"),
     log:
-        "<logs>/{scene}/edit_depths/{chunk}.log",
+        "<logs>/<scene>/edit_depths/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/edit_depths/{chunk}.tsv"
+        "<benchmarks>/<scene>/edit_depths/{chunk}.tsv"
     conda:
         "../envs/torch.yaml"
     threads: 1
@@ -31,13 +31,13 @@ rule edit_depths:
 # A physical camera is edited at all frames; its view for training has a few.
 rule edit_place:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
     output:
-        "<results>/{scene}/edit/views/{cam}.json",
+        "<results>/<scene>/edit/views/{cam}.json",
     log:
-        "<logs>/{scene}/edit_place/{cam}.log",
+        "<logs>/<scene>/edit_place/{cam}.log",
     benchmark:
-        "<benchmarks>/{scene}/edit_place/{cam}.tsv"
+        "<benchmarks>/<scene>/edit_place/{cam}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -51,20 +51,19 @@ rule edit_place:
 
 rule edit_background:
     input:
-        view="<results>/{scene}/edit/views/{cam}.json",
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        view="<results>/<scene>/edit/views/{cam}.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=lambda wildcards: expand(
-            "<results>/{scene}/disparity/{pair}/samples.npz",
-            scene=wildcards.scene,
+            "<results>/<scene>/disparity/{pair}/samples.npz",
             pair=pairs_without(wildcards.cam),
         ),
     output:
-        intermediate("foreground", "<results>/{scene}/edit/background/{cam}/{chunk}.npz"),
+        intermediate("foreground", "<results>/<scene>/edit/background/{cam}/{chunk}.npz"),
     log:
-        "<logs>/{scene}/edit_background/{cam}/{chunk}.log",
+        "<logs>/<scene>/edit_background/{cam}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/edit_background/{cam}/{chunk}.tsv"
+        "<benchmarks>/<scene>/edit_background/{cam}/{chunk}.tsv"
     conda:
         "../envs/torch.yaml"
     threads: 1
@@ -82,16 +81,16 @@ rule edit_masks:
     input:
         files_of_edit,
         edit="config/edits/{edit}.yaml",
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
-        depths=expand("<results>/{{scene}}/edit/depth/{chunk}.npz", chunk=CHUNKS),
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        depths=expand("<results>/<scene>/edit/depth/{chunk}.npz", chunk=CHUNKS),
         views=views_of_marks,
     output:
-        "<results>/{scene}/edits/{edit}/masks.npz",
+        "<results>/<scene>/edits/{edit}/masks.npz",
     log:
-        "<logs>/{scene}/edit_masks/{edit}.log",
+        "<logs>/<scene>/edit_masks/{edit}.log",
     benchmark:
-        "<benchmarks>/{scene}/edit_masks/{edit}.tsv"
+        "<benchmarks>/<scene>/edit_masks/{edit}.tsv"
     conda:
         "../envs/torch.yaml"
     threads: 1
@@ -109,19 +108,19 @@ rule edit_view:
     input:
         unpack(base_of_edit),
         edit="config/edits/{edit}.yaml",
-        masks="<results>/{scene}/edits/{edit}/masks.npz",
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
-        depths=expand("<results>/{{scene}}/edit/depth/{chunk}.npz", chunk=CHUNKS),
+        masks="<results>/<scene>/edits/{edit}/masks.npz",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        depths=expand("<results>/<scene>/edit/depth/{chunk}.npz", chunk=CHUNKS),
         disparity=disparities_of_edit,
         marks=views_of_marks,
-        models=expand("<results>/{{scene}}/composition/{level}/model.pt", level=LEVELS),
+        models=expand("<results>/<scene>/composition/{level}/model.pt", level=LEVELS),
     output:
-        directory("<results>/{scene}/edits/{edit}/{view}/{chunk}"),
+        directory("<results>/<scene>/edits/{edit}/{view}/{chunk}"),
     log:
-        "<logs>/{scene}/edit_view/{edit}/{view}/{chunk}.log",
+        "<logs>/<scene>/edit_view/{edit}/{view}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/edit_view/{edit}/{view}/{chunk}.tsv"
+        "<benchmarks>/<scene>/edit_view/{edit}/{view}/{chunk}.tsv"
     conda:
         "../envs/torch.yaml"
     threads: 1
@@ -141,18 +140,17 @@ rule edit_view:
 rule edit_film:
     input:
         lambda wildcards: expand(
-            "<results>/{scene}/edits/{edit}/{view}/{chunk}",
-            scene=wildcards.scene,
+            "<results>/<scene>/edits/{edit}/{view}/{chunk}",
             edit=wildcards.edit,
             view=wildcards.view,
             chunk=edited_chunks(wildcards.view),
         ),
     output:
-        "<results>/{scene}/edits/{edit}/{view}.mp4",
+        "<results>/<scene>/edits/{edit}/{view}.mp4",
     log:
-        "<logs>/{scene}/edit_film/{edit}/{view}.log",
+        "<logs>/<scene>/edit_film/{edit}/{view}.log",
     benchmark:
-        "<benchmarks>/{scene}/edit_film/{edit}/{view}.tsv"
+        "<benchmarks>/<scene>/edit_film/{edit}/{view}.tsv"
     conda:
         "../envs/torch.yaml"
     threads: 1
@@ -166,7 +164,7 @@ rule edit_film:
 rule edit_all:
     input:
         [
-            f"<results>/{SCENE.name}/edits/{name}/{view}.mp4"
+            f"<results>/<scene>/edits/{name}/{view}.mp4"
             for name, edit in EDITS.items()
             for view in edit.views
         ],

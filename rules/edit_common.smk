@@ -30,14 +30,13 @@ def edited_frames(wildcards):
 def views_of_marks(wildcards):
     """Trajectories that marks were drawn on; a camera's poses are known without."""
     views = {mark.view for mark in EDITS[wildcards.edit].marks} & set(TRAJECTORIES)
-    return expand("<results>/{scene}/views/{view}.json", scene=wildcards.scene, view=sorted(views))
+    return expand("<results>/<scene>/views/{view}.json", view=sorted(views))
 
 
 def disparities_of_depths(wildcards):
     """Of all pairs: a camera may help to measure its own depth."""
     return expand(
-        "<results>/{scene}/disparity/{pair}/{chunk}.npz",
-        scene=wildcards.scene,
+        "<results>/<scene>/disparity/{pair}/{chunk}.npz",
         pair=pairs_without(""),
         chunk=wildcards.chunk,
     )
@@ -50,8 +49,7 @@ def disparities_of_edit(wildcards):
         is_film = wildcards.view in TRAJECTORIES
         chunks = scene_chunks(wildcards.view, wildcards.chunk) if is_film else [wildcards.chunk]
     return expand(
-        "<results>/{scene}/disparity/{pair}/{chunk}.npz",
-        scene=wildcards.scene,
+        "<results>/<scene>/disparity/{pair}/{chunk}.npz",
         pair=pairs_without(wildcards.view),
         chunk=chunks,
     )
@@ -71,7 +69,7 @@ def base_of_edit(wildcards):
             "background": "edit/background/{view}/{chunk}.npz",
             "base": "frames/cameras/{view}.npz",
         }
-    return {key: f"<results>/{{scene}}/{name}" for key, name in names.items()}
+    return {key: f"<results>/<scene>/{name}" for key, name in names.items()}
 
 
 def base_flag(wildcards):

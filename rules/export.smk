@@ -10,14 +10,14 @@ except InputError as error:
 
 rule export_pictures:
     input:
-        film="<results>/{scene}/frames/cameras/{cam}.npz",
-        cameras="<results>/{scene}/sfm/cameras.json",
+        film="<results>/<scene>/frames/cameras/{cam}.npz",
+        cameras="<results>/<scene>/sfm/cameras.json",
     output:
-        directory("<results>/{scene}/export/pictures/{cam}"),
+        directory("<results>/<scene>/export/pictures/{cam}"),
     log:
-        "<logs>/{scene}/export_pictures/{cam}.log",
+        "<logs>/<scene>/export_pictures/{cam}.log",
     benchmark:
-        "<benchmarks>/{scene}/export_pictures/{cam}.tsv"
+        "<benchmarks>/<scene>/export_pictures/{cam}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -31,19 +31,18 @@ rule export_pictures:
 
 rule export_depth:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
         disparity=lambda wildcards: expand(
-            "<results>/{scene}/disparity/{pair}/{chunk}.npz",
-            scene=wildcards.scene,
+            "<results>/<scene>/disparity/{pair}/{chunk}.npz",
             pair=[pair for pair in pairs_without("") if wildcards.cam in pair.split("-")],
             chunk=CHUNKS,
         ),
     output:
-        "<results>/{scene}/export/depth/{cam}.npz",
+        "<results>/<scene>/export/depth/{cam}.npz",
     log:
-        "<logs>/{scene}/export_depth/{cam}.log",
+        "<logs>/<scene>/export_depth/{cam}.log",
     benchmark:
-        "<benchmarks>/{scene}/export_depth/{cam}.tsv"
+        "<benchmarks>/<scene>/export_depth/{cam}.tsv"
     wildcard_constraints:
         cam="|".join(SCENE.inputs),
     conda:
@@ -59,15 +58,15 @@ rule export_depth:
 
 rule export_event:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
-        pictures=expand("<results>/{{scene}}/export/pictures/{cam}", cam=SCENE.cameras),
-        depth=expand("<results>/{{scene}}/export/depth/{cam}.npz", cam=SCENE.inputs),
+        cameras="<results>/<scene>/sfm/cameras.json",
+        pictures=expand("<results>/<scene>/export/pictures/{cam}", cam=SCENE.cameras),
+        depth=expand("<results>/<scene>/export/depth/{cam}.npz", cam=SCENE.inputs),
     output:
-        directory("<results>/{scene}/export/{format}"),
+        directory("<results>/<scene>/export/{format}"),
     log:
-        "<logs>/{scene}/export_event/{format}.log",
+        "<logs>/<scene>/export_event/{format}.log",
     benchmark:
-        "<benchmarks>/{scene}/export_event/{format}.tsv"
+        "<benchmarks>/<scene>/export_event/{format}.tsv"
     wildcard_constraints:
         format="|".join(fourd_export.EVENT_FORMATS),
     conda:
@@ -84,27 +83,25 @@ rule export_event:
 
 rule export_film:
     input:
-        view="<results>/{scene}/views/{trajectory}.json",
-        cameras="<results>/{scene}/sfm/cameras.json",
+        view="<results>/<scene>/views/{trajectory}.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
         rendered=lambda wildcards: expand(
-            "<results>/{scene}/render/{view}/{chunk}",
-            scene=wildcards.scene,
+            "<results>/<scene>/render/{view}/{chunk}",
             view=wildcards.trajectory,
             chunk=chunks_of_view(wildcards.trajectory),
         ),
         estimates=lambda wildcards: expand(
-            "<results>/{scene}/{kind}/{view}/{chunk}.npz",
-            scene=wildcards.scene,
+            "<results>/<scene>/{kind}/{view}/{chunk}.npz",
             kind=["foreground", "background"],
             view=wildcards.trajectory,
             chunk=chunks_of_view(wildcards.trajectory),
         ),
     output:
-        directory("<results>/{scene}/export/{format}/{trajectory}"),
+        directory("<results>/<scene>/export/{format}/{trajectory}"),
     log:
-        "<logs>/{scene}/export_film/{format}/{trajectory}.log",
+        "<logs>/<scene>/export_film/{format}/{trajectory}.log",
     benchmark:
-        "<benchmarks>/{scene}/export_film/{format}/{trajectory}.tsv"
+        "<benchmarks>/<scene>/export_film/{format}/{trajectory}.tsv"
     wildcard_constraints:
         format="|".join(fourd_export.FILM_FORMATS),
     conda:
@@ -122,13 +119,11 @@ rule export_film:
 rule export:
     input:
         expand(
-            "<results>/{scene}/export/{format}",
-            scene=SCENE.name,
+            "<results>/<scene>/export/{format}",
             format=[name for name in EXPORT_FORMATS if name in fourd_export.EVENT_FORMATS],
         ),
         expand(
-            "<results>/{scene}/export/{format}/{trajectory}",
-            scene=SCENE.name,
+            "<results>/<scene>/export/{format}/{trajectory}",
             format=[name for name in EXPORT_FORMATS if name in fourd_export.FILM_FORMATS],
             trajectory=TRAJECTORIES,
         ),

@@ -3,14 +3,14 @@
 
 rule match_colours:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/align/cameras/{cam}.json", cam=SCENE.cameras),
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/align/cameras/{cam}.json", cam=SCENE.cameras),
     output:
-        "<results>/{scene}/frames/colour.json",
+        "<results>/<scene>/frames/colour.json",
     log:
-        "<logs>/{scene}/match_colours.log",
+        "<logs>/<scene>/match_colours.log",
     benchmark:
-        "<benchmarks>/{scene}/match_colours.tsv"
+        "<benchmarks>/<scene>/match_colours.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -24,14 +24,14 @@ rule match_colours:
 
 rule prepare_camera:
     input:
-        film="<results>/{scene}/align/cameras/{cam}.json",
-        colour="<results>/{scene}/frames/colour.json",
+        film="<results>/<scene>/align/cameras/{cam}.json",
+        colour="<results>/<scene>/frames/colour.json",
     output:
-        "<results>/{scene}/frames/cameras/{cam}.npz",
+        "<results>/<scene>/frames/cameras/{cam}.npz",
     log:
-        "<logs>/{scene}/prepare_camera/{cam}.log",
+        "<logs>/<scene>/prepare_camera/{cam}.log",
     benchmark:
-        "<benchmarks>/{scene}/prepare_camera/{cam}.tsv"
+        "<benchmarks>/<scene>/prepare_camera/{cam}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1

@@ -5,21 +5,21 @@
 # each of them the graph would have as many edges as pairs times cameras times chunks.
 rule fuse_training:
     input:
-        view=expand("<results>/{{scene}}/views/{cam}.json", cam=SCENE.inputs),
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        view=expand("<results>/<scene>/views/{cam}.json", cam=SCENE.inputs),
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=lambda wildcards: disparities_at("", wildcards.chunk),
         silhouettes=lambda wildcards: silhouettes_at(wildcards.chunk),
-        survey=ancient("<results>/{scene}/plan/survey.json"),
+        survey=ancient("<results>/<scene>/plan/survey.json"),
     output:
         [
-            intermediate("foreground", f"<results>/{{scene}}/foreground/{cam}/{{chunk}}.npz")
+            intermediate("foreground", f"<results>/<scene>/foreground/{cam}/{{chunk}}.npz")
             for cam in SCENE.inputs
         ],
     log:
-        "<logs>/{scene}/fuse_training/{chunk}.log",
+        "<logs>/<scene>/fuse_training/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/fuse_training/{chunk}.tsv"
+        "<benchmarks>/<scene>/fuse_training/{chunk}.tsv"
     priority: 10
     conda:
         "../envs/torch.yaml"
@@ -36,18 +36,18 @@ rule fuse_training:
 
 rule fuse_foreground:
     input:
-        view="<results>/{scene}/views/{view}.json",
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        view="<results>/<scene>/views/{view}.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=disparities_of_view,
         silhouettes=silhouettes_of_view,
-        survey=ancient("<results>/{scene}/plan/survey.json"),
+        survey=ancient("<results>/<scene>/plan/survey.json"),
     output:
-        intermediate("foreground", "<results>/{scene}/foreground/{view}/{chunk}.npz"),
+        intermediate("foreground", "<results>/<scene>/foreground/{view}/{chunk}.npz"),
     log:
-        "<logs>/{scene}/fuse_foreground/{view}/{chunk}.log",
+        "<logs>/<scene>/fuse_foreground/{view}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/fuse_foreground/{view}/{chunk}.tsv"
+        "<benchmarks>/<scene>/fuse_foreground/{view}/{chunk}.tsv"
     wildcard_constraints:
         view="|".join([*SCENE.heldout, *TRAJECTORIES]),
     priority: 10

@@ -22,12 +22,12 @@ rule probe_background:
     input:
         source=lambda wildcards: SCENE.cameras[wildcards.cam].background,
     output:
-        facts="<results>/{scene}/ingest/background/{cam}.json",
-        table="<results>/{scene}/ingest/background/{cam}.csv",
+        facts="<results>/<scene>/ingest/background/{cam}.json",
+        table="<results>/<scene>/ingest/background/{cam}.csv",
     log:
-        "<logs>/{scene}/probe_background/{cam}.log",
+        "<logs>/<scene>/probe_background/{cam}.log",
     benchmark:
-        "<benchmarks>/{scene}/probe_background/{cam}.tsv"
+        "<benchmarks>/<scene>/probe_background/{cam}.tsv"
     wildcard_constraints:
         cam="|".join(c for c, s in SCENE.cameras.items() if s.background) or "none",
     conda:
@@ -47,12 +47,12 @@ rule probe_camera:
     input:
         source=lambda wildcards: SCENE.cameras[wildcards.cam].source,
     output:
-        facts="<results>/{scene}/ingest/{cam}.json",
-        table="<results>/{scene}/ingest/{cam}.csv",
+        facts="<results>/<scene>/ingest/{cam}.json",
+        table="<results>/<scene>/ingest/{cam}.csv",
     log:
-        "<logs>/{scene}/probe_camera/{cam}.log",
+        "<logs>/<scene>/probe_camera/{cam}.log",
     benchmark:
-        "<benchmarks>/{scene}/probe_camera/{cam}.tsv"
+        "<benchmarks>/<scene>/probe_camera/{cam}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1

@@ -8,21 +8,21 @@ import time
 # only; settings are applied to them when the graph is built, so that a changed setting does not open it again.
 checkpoint survey:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
-        rectification=expand("<results>/{{scene}}/rectification/{pair}.npz", pair=SCENE.pairs),
-        need="<results>/{scene}/silhouettes/need.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        rectification=expand("<results>/<scene>/rectification/{pair}.npz", pair=SCENE.pairs),
+        need="<results>/<scene>/silhouettes/need.json",
         # Where clocks are found from motion, every film has been looked at for it.
         maps=(
             []
             if SCENE.clock_is_given
-            else expand("<results>/{{scene}}/align/maps/{cam}.npz", cam=SCENE.inputs)
+            else expand("<results>/<scene>/align/maps/{cam}.npz", cam=SCENE.inputs)
         ),
     output:
-        "<results>/{scene}/plan/survey.json",
+        "<results>/<scene>/plan/survey.json",
     log:
-        "<logs>/{scene}/survey.log",
+        "<logs>/<scene>/survey.log",
     benchmark:
-        "<benchmarks>/{scene}/survey.tsv"
+        "<benchmarks>/<scene>/survey.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -54,16 +54,16 @@ rule probe_machine:
 
 rule forecast:
     input:
-        survey="<results>/{scene}/plan/survey.json",
-        cameras="<results>/{scene}/sfm/cameras.json",
+        survey="<results>/<scene>/plan/survey.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
         machine=ancient("<results>/machine/speed.json"),
     output:
         # Not removed before: it keeps the first forecast, that of before the run.
-        update("<results>/{scene}/plan/plan.json"),
+        update("<results>/<scene>/plan/plan.json"),
     log:
-        "<logs>/{scene}/forecast.log",
+        "<logs>/<scene>/forecast.log",
     benchmark:
-        "<benchmarks>/{scene}/forecast.tsv"
+        "<benchmarks>/<scene>/forecast.tsv"
     localrule: True
     conda:
         "../envs/vision.yaml"
@@ -82,5 +82,5 @@ rule forecast:
 
 rule plan:
     input:
-        f"<results>/{SCENE.name}/plan/plan.json",
+        "<results>/<scene>/plan/plan.json",
     localrule: True

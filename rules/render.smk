@@ -3,16 +3,16 @@
 
 rule render_frames:
     input:
-        view="<results>/{scene}/views/{view}.json",
-        models=expand("<results>/{{scene}}/composition/{level}/model.pt", level=LEVELS),
-        foreground="<results>/{scene}/foreground/{view}/{chunk}.npz",
-        background="<results>/{scene}/background/{view}/{chunk}.npz",
+        view="<results>/<scene>/views/{view}.json",
+        models=expand("<results>/<scene>/composition/{level}/model.pt", level=LEVELS),
+        foreground="<results>/<scene>/foreground/{view}/{chunk}.npz",
+        background="<results>/<scene>/background/{view}/{chunk}.npz",
     output:
-        directory("<results>/{scene}/render/{view}/{chunk}"),
+        directory("<results>/<scene>/render/{view}/{chunk}"),
     log:
-        "<logs>/{scene}/render_frames/{view}/{chunk}.log",
+        "<logs>/<scene>/render_frames/{view}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/render_frames/{view}/{chunk}.tsv"
+        "<benchmarks>/<scene>/render_frames/{view}/{chunk}.tsv"
     priority: 20
     conda:
         "../envs/torch.yaml"
@@ -32,15 +32,15 @@ rule render_frames:
 rule encode_film:
     input:
         unpack(folders_of_film),
-        view="<results>/{scene}/views/{trajectory}.json",
-        cameras="<results>/{scene}/sfm/cameras.json",
+        view="<results>/<scene>/views/{trajectory}.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
     output:
-        film="<results>/{scene}/render/{trajectory}.mp4",
-        path="<results>/{scene}/render/{trajectory}.json",
+        film="<results>/<scene>/render/{trajectory}.mp4",
+        path="<results>/<scene>/render/{trajectory}.json",
     log:
-        "<logs>/{scene}/encode_film/{trajectory}.log",
+        "<logs>/<scene>/encode_film/{trajectory}.log",
     benchmark:
-        "<benchmarks>/{scene}/encode_film/{trajectory}.tsv"
+        "<benchmarks>/<scene>/encode_film/{trajectory}.tsv"
     conda:
         "../envs/torch.yaml"
     threads: 1
@@ -59,11 +59,11 @@ rule encode_master:
     input:
         unpack(folders_of_film),
     output:
-        "<results>/{scene}/render/{trajectory}.{suffix}",
+        "<results>/<scene>/render/{trajectory}.{suffix}",
     log:
-        "<logs>/{scene}/encode_master/{trajectory}.{suffix}.log",
+        "<logs>/<scene>/encode_master/{trajectory}.{suffix}.log",
     benchmark:
-        "<benchmarks>/{scene}/encode_master/{trajectory}.{suffix}.tsv"
+        "<benchmarks>/<scene>/encode_master/{trajectory}.{suffix}.tsv"
     wildcard_constraints:
         suffix="mov|mkv",
     conda:

@@ -12,15 +12,19 @@ rule report_page:
         EVALUATION,
         FILMS,
         truth=config["report"]["truth"] or [],
-        cameras="<results>/{scene}/sfm/cameras.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
     output:
-        page=report("<results>/{scene}/report/index.html", category="Scene"),
-        document="<results>/{scene}/report/report.json",
-        tables=multiext("<results>/{scene}/report/", "scores.csv", "costs.csv", "error_time.csv"),
+        page=report(
+            "<results>/<scene>/report/index.html",
+            category="Scene",
+            labels={"scene": SCENE.name, "what": "One page about the scene"},
+        ),
+        document="<results>/<scene>/report/report.json",
+        tables=multiext("<results>/<scene>/report/", "scores.csv", "costs.csv", "error_time.csv"),
     log:
-        "<logs>/{scene}/report_page.log",
+        "<logs>/<scene>/report_page.log",
     benchmark:
-        "<benchmarks>/{scene}/report_page.tsv"
+        "<benchmarks>/<scene>/report_page.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -31,14 +35,16 @@ rule report_page:
         benches=f"{Path(RESULTS).parent}/bench",
         settings=flags_from_mapping({"settings": json.dumps(config, sort_keys=True)}),
         options=options("report"),
+        # What else lies there is of an earlier scene.
+        current=flags_from_mapping({"num_levels": len(LEVELS), "edits": list(EDITS)}),
         version=fourd_config.stage_version("report"),
     shell:
         "python -m fourd.report --results $(dirname $(dirname {input.cameras})) --benchmarks {params.benchmarks}"
         " --stability {params.stability} --benches {params.benches} {params.settings}"
-        " {params.options} --output $(dirname {output.page}) 2> {log}"
+        " {params.options} {params.current} --output $(dirname {output.page}) 2> {log}"
 
 
 rule report_all:
     input:
-        expand("<results>/{scene}/report/index.html", scene=SCENE.name),
+        "<results>/<scene>/report/index.html",
     localrule: True

@@ -7,13 +7,13 @@ rule film_cameras:
     input:
         ingest=INGEST_OF_ALL,
         calibration=SCENE.calibration,
-        audio=[] if SCENE.clock_is_given else "<results>/{scene}/align/audio.json",
+        audio=[] if SCENE.clock_is_given else "<results>/<scene>/align/audio.json",
     output:
-        "<results>/{scene}/sfm/film_cameras.json",
+        "<results>/<scene>/sfm/film_cameras.json",
     log:
-        "<logs>/{scene}/film_cameras.log",
+        "<logs>/<scene>/film_cameras.log",
     benchmark:
-        "<benchmarks>/{scene}/film_cameras.tsv"
+        "<benchmarks>/<scene>/film_cameras.tsv"
     conda:
         "../envs/sfm.yaml"
     threads: 2
@@ -28,15 +28,15 @@ rule film_cameras:
 
 rule import_cameras:
     input:
-        calibration=SCENE.calibration or "<results>/{scene}/sfm/film_cameras.json",
-        films=expand("<results>/{{scene}}/align/cameras/{cam}.json", cam=SCENE.cameras),
+        calibration=SCENE.calibration or "<results>/<scene>/sfm/film_cameras.json",
+        films=expand("<results>/<scene>/align/cameras/{cam}.json", cam=SCENE.cameras),
     output:
-        cameras="<results>/{scene}/sfm/cameras.json",
-        points="<results>/{scene}/sfm/points.npz",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        points="<results>/<scene>/sfm/points.npz",
     log:
-        "<logs>/{scene}/import_cameras.log",
+        "<logs>/<scene>/import_cameras.log",
     benchmark:
-        "<benchmarks>/{scene}/import_cameras.tsv"
+        "<benchmarks>/<scene>/import_cameras.tsv"
     conda:
         "../envs/sfm.yaml"
     threads: 1

@@ -3,14 +3,14 @@
 
 rule judge_need:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
-        rectification=expand("<results>/{{scene}}/rectification/{pair}.npz", pair=SCENE.pairs),
+        cameras="<results>/<scene>/sfm/cameras.json",
+        rectification=expand("<results>/<scene>/rectification/{pair}.npz", pair=SCENE.pairs),
     output:
-        "<results>/{scene}/silhouettes/need.json",
+        "<results>/<scene>/silhouettes/need.json",
     log:
-        "<logs>/{scene}/judge_need.log",
+        "<logs>/<scene>/judge_need.log",
     benchmark:
-        "<benchmarks>/{scene}/judge_need.tsv"
+        "<benchmarks>/<scene>/judge_need.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -24,16 +24,16 @@ rule judge_need:
 
 rule background_plate:
     input:
-        film="<results>/{scene}/frames/cameras/{cam}.npz",
-        cameras="<results>/{scene}/sfm/cameras.json",
-        need="<results>/{scene}/silhouettes/need.json",
+        film="<results>/<scene>/frames/cameras/{cam}.npz",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        need="<results>/<scene>/silhouettes/need.json",
         background=empty_scene_of,
     output:
-        "<results>/{scene}/silhouettes/{cam}/plate.npz",
+        "<results>/<scene>/silhouettes/{cam}/plate.npz",
     log:
-        "<logs>/{scene}/background_plate/{cam}.log",
+        "<logs>/<scene>/background_plate/{cam}.log",
     benchmark:
-        "<benchmarks>/{scene}/background_plate/{cam}.tsv"
+        "<benchmarks>/<scene>/background_plate/{cam}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -49,15 +49,15 @@ rule background_plate:
 # All cameras of a chunk in one job: most scenes need no silhouettes, and then a job says no more than so.
 rule silhouettes:
     input:
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
-        plates=expand("<results>/{{scene}}/silhouettes/{cam}/plate.npz", cam=SCENE.inputs),
-        cameras="<results>/{scene}/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        plates=expand("<results>/<scene>/silhouettes/{cam}/plate.npz", cam=SCENE.inputs),
+        cameras="<results>/<scene>/sfm/cameras.json",
     output:
-        "<results>/{scene}/silhouettes/{chunk}.npz",
+        "<results>/<scene>/silhouettes/{chunk}.npz",
     log:
-        "<logs>/{scene}/silhouettes/{chunk}.log",
+        "<logs>/<scene>/silhouettes/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/silhouettes/{chunk}.tsv"
+        "<benchmarks>/<scene>/silhouettes/{chunk}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1

@@ -3,13 +3,13 @@
 
 rule rectify_pair:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
     output:
-        "<results>/{scene}/rectification/{pair}.npz",
+        "<results>/<scene>/rectification/{pair}.npz",
     log:
-        "<logs>/{scene}/rectify_pair/{pair}.log",
+        "<logs>/<scene>/rectify_pair/{pair}.log",
     benchmark:
-        "<benchmarks>/{scene}/rectify_pair/{pair}.tsv"
+        "<benchmarks>/<scene>/rectify_pair/{pair}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1
@@ -25,14 +25,14 @@ rule rectify_pair:
 rule disparity:
     input:
         unpack(films_of_pair),
-        cameras="<results>/{scene}/sfm/cameras.json",
-        rectification="<results>/{scene}/rectification/{pair}.npz",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        rectification="<results>/<scene>/rectification/{pair}.npz",
     output:
-        intermediate("disparity", "<results>/{scene}/disparity/{pair}/{chunk}.npz"),
+        intermediate("disparity", "<results>/<scene>/disparity/{pair}/{chunk}.npz"),
     log:
-        "<logs>/{scene}/disparity/{pair}/{chunk}.log",
+        "<logs>/<scene>/disparity/{pair}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/disparity/{pair}/{chunk}.tsv"
+        "<benchmarks>/<scene>/disparity/{pair}/{chunk}.tsv"
     priority: chunk_priority
     conda:
         "../envs/vision.yaml"

@@ -21,11 +21,11 @@ LATTICE_VIEWS = "|".join(LATTICE.views)
 # The steps of a film, under a folder of their own: these places are neither films nor scored.
 use rule place_view as place_lattice with:
     output:
-        "<results>/{scene}/lattice/views/{view}.json",
+        "<results>/<scene>/lattice/views/{view}.json",
     log:
-        "<logs>/{scene}/place_lattice/{view}.log",
+        "<logs>/<scene>/place_lattice/{view}.log",
     benchmark:
-        "<benchmarks>/{scene}/place_lattice/{view}.tsv"
+        "<benchmarks>/<scene>/place_lattice/{view}.tsv"
     wildcard_constraints:
         view=LATTICE_VIEWS,
     params:
@@ -36,20 +36,20 @@ use rule place_view as place_lattice with:
 
 use rule fuse_foreground as fuse_lattice with:
     input:
-        view="<results>/{scene}/lattice/views/{view}.json",
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        view="<results>/<scene>/lattice/views/{view}.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=lambda wildcards: disparities_at(
             wildcards.view, chunks_shown(LATTICE.frames, wildcards.chunk)
         ),
         silhouettes=lambda wildcards: silhouettes_at(chunks_shown(LATTICE.frames, wildcards.chunk)),
-        survey=ancient("<results>/{scene}/plan/survey.json"),
+        survey=ancient("<results>/<scene>/plan/survey.json"),
     output:
-        temp("<results>/{scene}/lattice/foreground/{view}/{chunk}.npz"),
+        temp("<results>/<scene>/lattice/foreground/{view}/{chunk}.npz"),
     log:
-        "<logs>/{scene}/fuse_lattice/{view}/{chunk}.log",
+        "<logs>/<scene>/fuse_lattice/{view}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/fuse_lattice/{view}/{chunk}.tsv"
+        "<benchmarks>/<scene>/fuse_lattice/{view}/{chunk}.tsv"
     wildcard_constraints:
         view=LATTICE_VIEWS,
     params:
@@ -58,17 +58,17 @@ use rule fuse_foreground as fuse_lattice with:
 
 use rule estimate_background as estimate_lattice_background with:
     input:
-        view="<results>/{scene}/lattice/views/{view}.json",
-        cameras="<results>/{scene}/sfm/cameras.json",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.inputs),
+        view="<results>/<scene>/lattice/views/{view}.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.inputs),
         disparity=sample_disparities,
-        survey=ancient("<results>/{scene}/plan/survey.json"),
+        survey=ancient("<results>/<scene>/plan/survey.json"),
     output:
-        temp("<results>/{scene}/lattice/background/{view}/{chunk}.npz"),
+        temp("<results>/<scene>/lattice/background/{view}/{chunk}.npz"),
     log:
-        "<logs>/{scene}/estimate_lattice_background/{view}/{chunk}.log",
+        "<logs>/<scene>/estimate_lattice_background/{view}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/estimate_lattice_background/{view}/{chunk}.tsv"
+        "<benchmarks>/<scene>/estimate_lattice_background/{view}/{chunk}.tsv"
     wildcard_constraints:
         view=LATTICE_VIEWS,
     params:
@@ -77,16 +77,16 @@ use rule estimate_background as estimate_lattice_background with:
 
 use rule render_frames as render_lattice with:
     input:
-        view="<results>/{scene}/lattice/views/{view}.json",
-        models=expand("<results>/{{scene}}/composition/{level}/model.pt", level=LEVELS),
-        foreground="<results>/{scene}/lattice/foreground/{view}/{chunk}.npz",
-        background="<results>/{scene}/lattice/background/{view}/{chunk}.npz",
+        view="<results>/<scene>/lattice/views/{view}.json",
+        models=expand("<results>/<scene>/composition/{level}/model.pt", level=LEVELS),
+        foreground="<results>/<scene>/lattice/foreground/{view}/{chunk}.npz",
+        background="<results>/<scene>/lattice/background/{view}/{chunk}.npz",
     output:
-        directory("<results>/{scene}/lattice/render/{view}/{chunk}"),
+        directory("<results>/<scene>/lattice/render/{view}/{chunk}"),
     log:
-        "<logs>/{scene}/render_lattice/{view}/{chunk}.log",
+        "<logs>/<scene>/render_lattice/{view}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/render_lattice/{view}/{chunk}.tsv"
+        "<benchmarks>/<scene>/render_lattice/{view}/{chunk}.tsv"
     wildcard_constraints:
         view=LATTICE_VIEWS,
     params:
@@ -95,14 +95,14 @@ use rule render_frames as render_lattice with:
 
 rule map_lattice:
     input:
-        foreground="<results>/{scene}/lattice/foreground/{view}/{chunk}.npz",
-        background="<results>/{scene}/lattice/background/{view}/{chunk}.npz",
+        foreground="<results>/<scene>/lattice/foreground/{view}/{chunk}.npz",
+        background="<results>/<scene>/lattice/background/{view}/{chunk}.npz",
     output:
-        "<results>/{scene}/lattice/maps/{view}/{chunk}.npz",
+        "<results>/<scene>/lattice/maps/{view}/{chunk}.npz",
     log:
-        "<logs>/{scene}/map_lattice/{view}/{chunk}.log",
+        "<logs>/<scene>/map_lattice/{view}/{chunk}.log",
     benchmark:
-        "<benchmarks>/{scene}/map_lattice/{view}/{chunk}.tsv"
+        "<benchmarks>/<scene>/map_lattice/{view}/{chunk}.tsv"
     wildcard_constraints:
         view=LATTICE_VIEWS,
     priority: 20
@@ -118,27 +118,27 @@ rule map_lattice:
 
 rule viewer_page:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
-        points="<results>/{scene}/sfm/points.npz",
-        films=expand("<results>/{{scene}}/frames/cameras/{cam}.npz", cam=SCENE.cameras),
-        views=expand("<results>/{{scene}}/lattice/views/{view}.json", view=LATTICE.views),
+        cameras="<results>/<scene>/sfm/cameras.json",
+        points="<results>/<scene>/sfm/points.npz",
+        films=expand("<results>/<scene>/frames/cameras/{cam}.npz", cam=SCENE.cameras),
+        views=expand("<results>/<scene>/lattice/views/{view}.json", view=LATTICE.views),
         render=expand(
-            "<results>/{{scene}}/lattice/render/{view}/{chunk}",
+            "<results>/<scene>/lattice/render/{view}/{chunk}",
             view=LATTICE.views,
             chunk=LATTICE_CHUNKS,
         ),
         maps=expand(
-            "<results>/{{scene}}/lattice/maps/{view}/{chunk}.npz",
+            "<results>/<scene>/lattice/maps/{view}/{chunk}.npz",
             view=LATTICE.views,
             chunk=LATTICE_CHUNKS,
         ),
     output:
-        page="<results>/{scene}/viewer/index.html",
-        data=directory("<results>/{scene}/viewer/data"),
+        page="<results>/<scene>/viewer/index.html",
+        data=directory("<results>/<scene>/viewer/data"),
     log:
-        "<logs>/{scene}/viewer_page.log",
+        "<logs>/<scene>/viewer_page.log",
     benchmark:
-        "<benchmarks>/{scene}/viewer_page.tsv"
+        "<benchmarks>/<scene>/viewer_page.tsv"
     conda:
         "../envs/torch.yaml"
     threads: 1
@@ -154,5 +154,5 @@ rule viewer_page:
 
 rule viewer:
     input:
-        expand("<results>/{scene}/viewer/index.html", scene=SCENE.name),
+        "<results>/<scene>/viewer/index.html",
     localrule: True

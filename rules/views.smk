@@ -3,13 +3,13 @@
 
 rule place_view:
     input:
-        cameras="<results>/{scene}/sfm/cameras.json",
+        cameras="<results>/<scene>/sfm/cameras.json",
     output:
-        "<results>/{scene}/views/{view}.json",
+        "<results>/<scene>/views/{view}.json",
     log:
-        "<logs>/{scene}/place_view/{view}.log",
+        "<logs>/<scene>/place_view/{view}.log",
     benchmark:
-        "<benchmarks>/{scene}/place_view/{view}.tsv"
+        "<benchmarks>/<scene>/place_view/{view}.tsv"
     conda:
         "../envs/vision.yaml"
     threads: 1

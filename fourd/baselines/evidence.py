@@ -44,7 +44,8 @@ class Evidence:
     films:      features of all input cameras over the whole event
     query:      feature of the truth
     others:     frames that other programs rendered, by the name of the method
-    humans:     folder of the networks and the body of SfM+humans, empty without
+    people:     (N, P) fits of the body to the people of the moment, None where nobody was looked for
+    no_people:  why not;  humans: folder with the body
     """
 
     foreground: Mapping[str, np.ndarray]
@@ -57,13 +58,14 @@ class Evidence:
     films: FilmIndex
     query: np.ndarray
     others: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    people: np.ndarray | None = None
+    no_people: str = ""
     humans: str = ""
 
     @functools.cached_property
     def depth(self) -> np.ndarray:
         """(H, W) float32 z of the surface in view: of the consensus, else of the background, else NaN."""
-        static = np.where(self.background["farthest_valid"], self.background["depth"], np.float32(np.nan))
-        return np.where(self.foreground["consensus_valid"], self.foreground["depth"], static)
+        return surface_depth(self.foreground, self.background)
 
     @functools.cached_property
     def warp(self) -> Warp:
@@ -73,3 +75,9 @@ class Evidence:
             self.camera,
             [(entry.image, entry.valid, entry.camera) for entry in self.inputs.values()],
         )
+
+
+def surface_depth(foreground: Mapping[str, np.ndarray], background: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(H, W) float32 z of the consensus, else of the background, else NaN; arrays as in `Evidence`."""
+    static = np.where(background["farthest_valid"], background["depth"], np.float32(np.nan))
+    return np.where(foreground["consensus_valid"], foreground["depth"], static)

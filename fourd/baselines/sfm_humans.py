@@ -15,22 +15,20 @@ from fourd.baselines.evidence import Evidence, Unavailable
 def render(evidence: Evidence) -> np.ndarray:
     """(H, W, 3) uint8; without people it is SfM densified.
 
-    Raises Unavailable without the models or sparse points.
+    Raises Unavailable where nobody was looked for, or without sparse points.
     """
-    # Loaded only where people are to be fitted: it takes longer than most jobs' other imports.
-    from fourd.baselines.humans import load_models, missing_models
+    # Loaded only where people were fitted: it takes longer than most jobs' other imports.
+    from fourd.baselines.humans import load_body, missing_models
     from fourd.baselines.humans.mesh import colour_surface
 
-    reason = missing_models(evidence.humans)
-    if reason is not None:
-        raise Unavailable(reason)
+    if evidence.people is None:
+        raise Unavailable(evidence.no_people or missing_models("") or "")
     image = sfm_dense.render(evidence)
-    models = load_models(evidence.humans)
-    bodies = models.fit_people({name: (entry.image, entry.camera) for name, entry in evidence.inputs.items()})
-    if not bodies:
+    if not len(evidence.people):
         return image
-    count = len(models.body.vertices)
-    faces = np.concatenate([models.body.faces + i * count for i in range(len(bodies))])
+    body = load_body(evidence.humans)
+    vertices = [body.place_vertices(fit) for fit in evidence.people]
+    faces = np.concatenate([body.faces + i * len(body.vertices) for i in range(len(vertices))])
     inputs = {name: (entry.image, entry.valid, entry.camera) for name, entry in evidence.inputs.items()}
-    people, shown = colour_surface(np.concatenate(bodies), faces, evidence.camera, inputs)
+    people, shown = colour_surface(np.concatenate(vertices), faces, evidence.camera, inputs)
     return np.where(shown[..., None], people, image)

@@ -1,8 +1,8 @@
 """Make the demo event: `python -m fourd.demo COMMAND --named arguments`.
 
 Commands: `camera` (synchronised frames of one camera), `cameras` (their calibration), `phones` (the
-file one phone recorded), `labels` (what moves, as one camera sees it), `truth` (clocks, depth,
-labels, orbit, parameters).
+file one phone recorded), `labels` (what moves, as one camera sees it), `depths` (how far it is), `truth`
+(clocks, depth, labels, orbit, parameters).
 """
 
 import argparse
@@ -14,7 +14,14 @@ from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
 from fourd.demo import DemoOptions, label_numbers
 from fourd.demo.options import camera_index, check_options
 from fourd.demo.phones import write_phone_file
-from fourd.demo.truth import PARTS, write_camera_frames, write_camera_labels, write_cameras, write_truth
+from fourd.demo.truth import (
+    PARTS,
+    write_camera_depths,
+    write_camera_frames,
+    write_camera_labels,
+    write_cameras,
+    write_truth,
+)
 
 
 def _make_parser() -> argparse.ArgumentParser:
@@ -25,15 +32,16 @@ def _make_parser() -> argparse.ArgumentParser:
         ("cameras", "write the calibration of all cameras"),
         ("phones", "write the video file of one phone"),
         ("labels", "write which pixels of one camera move to a folder"),
+        ("depths", "write the true depth of one camera to a folder"),
         ("truth", "write clocks, depth, labels, orbit and parameters to a folder"),
     ):
         sub = commands.add_parser(command, help=text)
         sub.add_argument("--output", type=Path, required=True)
-        if command in ("camera", "phones", "labels"):
+        if command in ("camera", "phones", "labels", "depths"):
             sub.add_argument("--name", required=True, help="cam00, cam01, ...")
         if command != "cameras":
             sub.add_argument("--without", nargs="*", default=[], help="figure1, figure2, ball")
-        if command == "labels":
+        if command in ("labels", "depths"):
             sub.add_argument("--of-phone", action="store_true", help="of the phone's film, on its own clock")
         if command == "truth":
             sub.add_argument("--only", nargs="*", default=list(PARTS), help=f"(default: {' '.join(PARTS)})")
@@ -60,6 +68,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         write_camera_frames(args.output, args.name, options, without)
     elif args.command == "labels":
         write_camera_labels(args.output, args.name, options, without, args.of_phone)
+    elif args.command == "depths":
+        write_camera_depths(args.output, args.name, options, without, args.of_phone)
     else:
         write_phone_file(args.output, args.name, options, without)
 

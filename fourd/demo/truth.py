@@ -48,6 +48,21 @@ def write_camera_labels(
             write_png(folder / f"{frame:06d}.png", scene.trace(camera_at(name, float(time_s), options))[1])
 
 
+def write_camera_depths(
+    output: Path | str, name: str, options: DemoOptions, without: Sequence[int] = (), of_phone: bool = False
+) -> None:
+    """Write the depth of one camera's frames to OUTPUT/000000.npz ...: `z`, metres, infinite in the sky.
+
+    of_phone: the frames are those of the phone's film instead of the synchronised ones
+    """
+    times = make_phone(name, options).frame_times if of_phone else clip_times(options)
+    with atomic_folder(output) as folder:
+        for frame, time_s in enumerate(times):
+            scene = FrozenScene(float(time_s), options, without)
+            with ArchiveWriter(folder / f"{frame:06d}.npz") as archive:
+                archive.add("z", scene.trace(camera_at(name, float(time_s), options))[0])
+
+
 def write_cameras(output: Path | str, options: DemoOptions) -> None:
     """Write all cameras of the synchronised frames in the native calibration format."""
     tracks = camera_tracks(options)

@@ -5,6 +5,7 @@ Commands: `mark` (write an edit file with one mark), `depths` (depth of every ca
 """
 
 import argparse
+import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,15 +14,21 @@ import yaml
 
 from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
 from fourd.edit.options import EditOptions
-from fourd.edit.spec import read_edit
+from fourd.edit.spec import parse_edit, read_edit
 from fourd.errors import InputError
 from fourd.fuse.options import FuseOptions
 from fourd.io import write_png, write_text
 from fourd.render import RenderOptions
 
+log = logging.getLogger(__name__)
+
 
 def write_mark(args: argparse.Namespace) -> None:
-    """Write an edit file, and the picture that the mark is drawn on if asked for. Raises InputError."""
+    """Write an edit file, and the picture that the mark is drawn on if asked for.
+
+    A file that says the same is left alone, comments included. Raises InputError, for a file that says
+    something else as well.
+    """
     if args.picture is not None:
         from fourd.ingest import open_camera
 
@@ -56,13 +63,16 @@ def write_mark(args: argparse.Namespace) -> None:
         document["order"] = args.order
     if args.shift_frames:
         document["insert"] = {"shift_frames": args.shift_frames}
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
-    write_text(args.output, text)
-    try:
-        read_edit(args.output)
-    except InputError:
-        args.output.unlink()
-        raise
+    edit = parse_edit(document, args.output)
+    if args.output.exists():
+        if read_edit(args.output) != edit:
+            raise InputError(
+                f"mark: expected a new file at {args.output}, got one that says something else: give another "
+                "name, or remove the file"
+            )
+        log.info("%s says so already", args.output)
+        return
+    write_text(args.output, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
 
 
 def _make_parser() -> argparse.ArgumentParser:

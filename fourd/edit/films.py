@@ -17,7 +17,7 @@ from fourd.edit.instants import Instants
 from fourd.edit.layers import LayeredPairs
 from fourd.edit.options import EditOptions
 from fourd.edit.origin import find_origin
-from fourd.edit.plate import plate_of
+from fourd.edit.plate import FARTHEST, NEAREST, plate_of
 from fourd.edit.spec import INSERT, KEEP_ONLY, REMOVE, Edit
 from fourd.errors import InputError
 from fourd.fuse.files import DisparityFiles, Progress
@@ -200,7 +200,7 @@ class Editor:
         far = float(np.median(depth)) if depth.size else 1.0
         views = self.instants.still(self._view.name, entry.scene_frame)
         window = slice(0, height), slice(0, width)
-        return plate_of(entry.camera, window, (0.2 * far, 100 * far), views)
+        return plate_of(entry.camera, window, (NEAREST * far, FARTHEST * far), views)
 
     def edit_frame(self, frame: int) -> Canvas:
         """One output frame."""

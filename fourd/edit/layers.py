@@ -37,7 +37,6 @@ class LayeredPairs(Sequence[PairFrame]):
             name: mask.astype(np.uint8) if is_kept else cv2.dilate(mask.astype(np.uint8), disc)
             for name, mask in masks.items()
         }
-        self._kept: dict[int, PairFrame] = {}
 
     def __len__(self) -> int:
         return len(self._pairs)

@@ -10,6 +10,9 @@ from fourd.edit.voxels import MOVER, OBJECT, OTHER, UNKNOWN
 
 # Pixels on either side of an outline by depth that colour may decide.
 _INNER_PX, _OUTER_PX = 2, 4
+# Beyond it colour may follow what differs from other times, if that is nearer to the thing than to others: a
+# foot on the ground has the ground's depth. About a shoe at the size that figures have, px.
+_LIMB_PX = 14
 # Depth may be as much too wide, px: so deep may what looks as at other times be cut away.
 _EDGE_PX = 7
 # Depth beside an outline belongs to either side, px.
@@ -42,12 +45,12 @@ def refine_outline(
     inside = _without_specks(inside)
     if int(inside.sum()) < _MIN_PIXELS:
         return inside > 0
-    window = _window(inside, 4 * _OUTER_PX)
+    window = _window(inside, _LIMB_PX + _OUTER_PX)
     part, picture, told, maybe = inside[window], image[window], kind[window], likely[window]
     plate, known = find_plate(window)[:2]
     same = known & is_plate(picture, plate)
     differs = known & ~same
-    near = cv2.dilate(part, _disc(_OUTER_PX)) > 0
+    near = (cv2.dilate(part, _disc(_OUTER_PX)) > 0) | _find_limbs(part, differs, told)
     core = cv2.erode(part, _disc(_INNER_PX)) > 0
     edge = (cv2.erode(part, _disc(_EDGE_PX)) == 0) & (part > 0)
     trimap = np.full(part.shape, cv2.GC_BGD, np.uint8)
@@ -68,6 +71,21 @@ def refine_outline(
     mask = np.zeros(kind.shape, bool)
     mask[window] = _without_specks(cut) > 0
     return mask
+
+
+def _find_limbs(part: np.ndarray, differs: np.ndarray, told: np.ndarray) -> np.ndarray:
+    """(h, w) bool: what hangs together with the part, differs from other times and is no one else's."""
+    ours, theirs = (
+        cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
+        for region in (part > 0, told == MOVER)
+    )
+    free = differs & (told != MOVER) & (ours <= _LIMB_PX) & (ours < theirs)
+    free = cv2.morphologyEx(free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    joined = (free | (part > 0)).astype(np.uint8)
+    labels = np.asarray(cv2.connectedComponents(joined)[1], dtype=np.int64)
+    touched = np.zeros(int(labels.max()) + 1, bool)
+    touched[np.unique(labels[part > 0])] = True
+    return touched[labels] & free
 
 
 def widen(mask: np.ndarray, radius: int) -> np.ndarray:

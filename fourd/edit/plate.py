@@ -9,6 +9,9 @@ from fourd.camera import Camera
 from fourd.edit.moving import project_ideal, sample_depth
 
 Window = tuple[slice, slice]
+# Depths between which a plate is looked for, as multiples of a typical one: from half an arm before the
+# nearest wall to where a ray no longer moves by a pixel in another picture.
+NEAREST, FARTHEST = 0.2, 100.0
 # Difference of two depths of one surface, as a share of the depth.
 _SAME = 0.03
 # A picture is as bright as its plate times 1, give or take noise, or darker in a shadow.

@@ -65,17 +65,21 @@ class Edit:
 def read_edit(path: Path | str) -> Edit:
     """An edit file, checked as far as it can be without the scene. Raises InputError."""
     source = Path(path)
-    if not _NAME.fullmatch(source.stem):
-        raise InputError(
-            f"{source}: expected a name of small letters, digits and _ that begins with a letter, at most "
-            "32, because results are stored under it: rename the file"
-        )
     if source.is_file() and source.stat().st_size > _MAX_BYTES:
         raise InputError(
             f"{source}: expected an edit of at most {_MAX_BYTES} bytes, got {source.stat().st_size}: "
             "give a mask as a PNG instead of a list of points"
         )
-    document = load_yaml(source)
+    return parse_edit(load_yaml(source), source)
+
+
+def parse_edit(document: dict[str, Any], source: Path) -> Edit:
+    """What an edit file says, or is going to say. source: the file. Raises InputError."""
+    if not _NAME.fullmatch(source.stem):
+        raise InputError(
+            f"{source}: expected a name of small letters, digits and _ that begins with a letter, at most "
+            "32, because results are stored under it: rename the file"
+        )
     schema = load_yaml(SCHEMA_FOLDER / "edit_file.schema.yaml")
     validate(document, schema, str(source))
     document = fill_defaults(document, schema)

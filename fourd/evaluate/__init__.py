@@ -6,7 +6,7 @@ sheet. Nothing that makes a render reads what this stage writes, or a held-out c
 
 import dataclasses
 
-STAGE_VERSION = 3
+STAGE_VERSION = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,6 +21,7 @@ class EvaluateOptions:
     lpips_net: str = "alex"
     inception: str = ""
     humans: str = ""
+    depths: str = ""
     other: tuple[str, ...] = ()
     sheet_frames: int = 3
     sheet_tile_px: int = 288

@@ -12,7 +12,7 @@ from fourd.evaluate import EvaluateOptions
 from fourd.evaluate.contact_sheet import SheetRow, amplified_error, draw_sheet
 from fourd.evaluate.evidence import EvidenceReader, Sources
 from fourd.evaluate.regions import surface_regions
-from fourd.evaluate.score import ALL_FRAMES, Frame, Scorer, score_image, score_masks
+from fourd.evaluate.score import ALL_FRAMES, Frame, Scorer, score_image, score_masks, score_true_depth
 from fourd.image import label_image
 from fourd.io import write_csv, write_png
 from fourd.render import with_progress
@@ -104,6 +104,8 @@ def _score_frames(
         scores = scorer.score(Frame(images, evidence.truth, valid, moves), regions, reasons, remarks)
         scores.sort(key=lambda score: order.index(score["method"]))
         scores += [] if true is None else score_masks(found & valid, moves)
+        depth = reader.read_depth(entry)
+        scores += [] if depth is None else score_true_depth(evidence, depth, regions)
         rows += [
             {
                 "view": reader.view.name,

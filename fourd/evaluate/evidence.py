@@ -2,17 +2,20 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from fourd.baselines import METHODS, Evidence, InputPicture
+from fourd.baselines.evidence import surface_depth
 from fourd.baselines.nearest import FALLBACK_FEATURE, NETWORK_FEATURE, FilmIndex, describe_image
 from fourd.camera import Camera
 from fourd.config import spread_frames
 from fourd.errors import InputError
 from fourd.evaluate import EvaluateOptions
+from fourd.evaluate.depth import CONSENSUS, SURFACE, fit_scale, read_true_depth
+from fourd.evaluate.people import read_people, see_input
 from fourd.evaluate.regions import StillPicture, find_dynamic_pixels, read_dynamic_mask
 from fourd.image import undistort
 from fourd.ingest import open_camera
@@ -20,13 +23,13 @@ from fourd.io import Archive, read_image
 from fourd.metrics_lpips import load_network, missing_weights
 from fourd.render import BackgroundReader, list_frames, read_arrays
 from fourd.sfm import SceneCameras, read_cameras
-from fourd.views import View, ViewFrame, physical_view, read_view
+from fourd.views import View, ViewFrame, read_view
 
 FOREGROUND_KEYS = ("consensus_rgb", "consensus_valid", "depth", "num_cameras")
 BACKGROUND_KEYS = ("farthest_rgb", "farthest_valid", "depth", "filled")
 STILL_FRAMES = 15
 # Columns of the contact sheet and rows of the table that are no methods.
-RESERVED_NAMES = ("truth", "error", "masks")
+RESERVED_NAMES = ("truth", "error", "masks", CONSENSUS, SURFACE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +37,8 @@ class Sources:
     """Files of one held-out camera (docs/formats.md); `films` maps camera names to their files.
 
     labels: folder of its true masks;  points: sfm/points.npz, without which there are no sparse points
+    people: of `fourd.evaluate.people`
+    is_recovered: cameras were found from the films alone, so the unit of depth is not known
     """
 
     view: Path
@@ -44,6 +49,8 @@ class Sources:
     background: tuple[Path, ...]
     labels: Path | None = None
     points: Path | None = None
+    people: Path | None = None
+    is_recovered: bool = False
 
 
 class EvidenceReader:
@@ -55,6 +62,8 @@ class EvidenceReader:
         self._scene = read_cameras(sources.cameras)
         _check_heldout(self.view, self._scene, sources)
         self._labels = sources.labels
+        self._is_recovered = sources.is_recovered
+        self._people, self._no_people = read_people(sources.people, self._options.humans)
         self._points = _read_points(sources.points)
         self.others = _list_others(self._options.other, self.view)
         self._readers = {
@@ -88,7 +97,7 @@ class EvidenceReader:
                     f"view {self.view.name}: expected frame {frame} in the files of {what}, found none: "
                     "give the files of all chunks"
                 )
-        truth, valid = self._see(self.view.name, entry)
+        truth, valid = self._see_truth(entry)
         foreground = read_arrays(self._foreground[frame], frame, FOREGROUND_KEYS)
         background = self._background[frame].read(frame)
         rendered = read_image(self._rendered[frame])
@@ -109,6 +118,8 @@ class EvidenceReader:
             self.films,
             self._describe(truth),
             {name: read_image(files[frame]) for name, files in self.others.items()},
+            None if self._no_people else self._people.get(entry.scene_frame),
+            self._no_people or f"nobody was looked for at frame {entry.scene_frame}",
             self._options.humans,
         ), valid
 
@@ -119,6 +130,31 @@ class EvidenceReader:
         camera = self._scene.tracks[self.view.name].at(entry.scene_frame)
         shown = self._readers[self.view.name].source_frame(entry.scene_frame)
         return read_dynamic_mask(self._labels, shown, camera, entry.camera)
+
+    def read_depth(self, entry: ViewFrame) -> np.ndarray | None:
+        """(H, W) float32 true z in world units, NaN where nobody knows; None where the frame has none."""
+        true = self._read_true_depth(entry)
+        return None if true is None else true / np.float32(self._depth_unit)
+
+    def _read_true_depth(self, entry: ViewFrame) -> np.ndarray | None:
+        if not self._options.depths:
+            return None
+        camera = self._scene.tracks[self.view.name].at(entry.scene_frame)
+        shown = self._readers[self.view.name].source_frame(entry.scene_frame)
+        return read_true_depth(Path(self._options.depths) / self.view.name, shown, camera, entry.camera)
+
+    @functools.cached_property
+    def _depth_unit(self) -> float:
+        """Units of the true depth in a world unit: the calibration's, or those that fit best."""
+        return fit_scale(self._depth_pairs()) if self._is_recovered else self._scene.scale
+
+    def _depth_pairs(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for entry in self.view.frames:
+            true = self._read_true_depth(entry)
+            if true is not None:
+                keys = ("consensus_valid", "depth")
+                foreground = read_arrays(self._foreground[entry.frame], entry.frame, keys)
+                yield surface_depth(foreground, self._background[entry.frame].read(entry.frame)), true
 
     def find_moves(self, entry: ViewFrame, evidence: Evidence) -> np.ndarray:
         """(H, W) bool, where something moves by what no still picture explains."""
@@ -166,14 +202,14 @@ class EvidenceReader:
         image, valid, camera = self._see_input(name, scene_frame)
         return InputPicture(image, valid, camera, self.films.feature_of(name, scene_frame))
 
-    def _see(self, name: str, entry: ViewFrame) -> tuple[np.ndarray, np.ndarray]:
+    def _see_truth(self, entry: ViewFrame) -> tuple[np.ndarray, np.ndarray]:
         # The truth is what was filmed: nothing in it is moved to the common time.
-        image = self._readers[name].read(entry.scene_frame, is_compensated=name != self.view.name)
+        name = self.view.name
+        image = self._readers[name].read(entry.scene_frame, is_compensated=False)
         return undistort(image, self._scene.tracks[name].at(entry.scene_frame), entry.camera)
 
     def _see_input(self, name: str, scene_frame: int) -> tuple[np.ndarray, np.ndarray, Camera]:
-        entry = physical_view(self._scene, name, [scene_frame], self.view.size).frames[0]
-        return *self._see(name, entry), entry.camera
+        return see_input(self._readers[name], self._scene, name, scene_frame, self.view.size)
 
 
 def _read_points(path: Path | None) -> np.ndarray:

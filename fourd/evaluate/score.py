@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from fourd import metrics
+from fourd.baselines import Evidence
 from fourd.evaluate import EvaluateOptions
+from fourd.evaluate.depth import CONSENSUS, SURFACE, score_depth
 from fourd.evaluate.regions import compare_masks
 from fourd.metrics_distribution import frechet_distance, kernel_distance
 from fourd.metrics_fid import load_inception
@@ -16,9 +18,10 @@ from fourd.metrics_lpips import load_network, missing_weights
 
 # By the first word of the metric.
 SET_METRICS = {"frechet": frechet_distance, "kernel": kernel_distance, "fid": frechet_distance}
-# No methods may have these names: the true pictures, and rows of the workflow's own masks.
+# No methods may have these names: the true pictures, and rows of the workflow's own masks and depths.
 TRUTH = "truth"
 MASKS = "masks"
+ESTIMATES = (MASKS, CONSENSUS, SURFACE)
 # Where a method is expected to have a value in every frame.
 HEADLINE = ("full", "psnr_db")
 # The frame of values that are of all frames of a camera together.
@@ -86,6 +89,18 @@ def score_masks(found: np.ndarray, true: np.ndarray) -> list[dict[str, Any]]:
     for metric, value in compare_masks(found, true).items():
         row = _row(MASKS, "dynamic", metric, value, int(true.sum()))
         rows.append({**row, "note": "" if row["value"] else "nothing is marked"})
+    return rows
+
+
+def score_true_depth(
+    evidence: Evidence, true: np.ndarray, regions: Mapping[str, np.ndarray]
+) -> list[dict[str, Any]]:
+    """Rows of the workflow's own depth against the true one, (H, W) z in world units."""
+    rows = []
+    for method, region, metric, value, count in score_depth(evidence, true, regions):
+        reason = "no true depth is known there" if metric == "depth_coverage" else "there is no estimate"
+        row = _row(method, region, metric, value, count)
+        rows.append({**row, "note": "" if row["value"] else reason})
     return rows
 
 

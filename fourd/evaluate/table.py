@@ -9,7 +9,8 @@ from fourd.errors import InputError
 from fourd.evaluate import summary
 from fourd.evaluate.camera import COLUMNS
 from fourd.evaluate.contact_sheet import stack_sheets
-from fourd.evaluate.score import MASKS
+from fourd.evaluate.depth import CONSENSUS, SURFACE
+from fourd.evaluate.score import ESTIMATES, MASKS
 from fourd.evaluate.summary import Summary, differences, summarize_all, summarize_rows, summary_rows
 from fourd.io import read_csv, read_image, write_csv, write_png, write_text
 
@@ -36,6 +37,13 @@ REGIONS = {
     "outside_hull": "outside the cameras",
 }
 MASK_METRICS = {"mask_iou": "IoU", "mask_precision": "precision", "mask_recall": "recall"}
+DEPTH_METRICS = {
+    "depth_coverage": ("covered", "{:.1%}"),
+    "depth_error": ("median error", "{:.2%}"),
+    "depth_within_1": ("within 1 %", "{:.1%}"),
+    "depth_within_5": ("within 5 %", "{:.1%}"),
+}
+DEPTHS = {CONSENSUS: "consensus", SURFACE: "consensus over background"}
 SOURCES = {"truth": "true masks", "pipeline": "masks of the workflow"}
 CONVENTIONS = (
     "MSE of 8-bit values, mean over channels. SSIM and MS-SSIM: Gaussian window of 11 px, sigma 1.5 px, "
@@ -79,7 +87,7 @@ def read_metrics(path: Path) -> list[dict[str, str]]:
 
 def draw_table(rows: Sequence[Row], summaries: Summaries) -> str:
     """Markdown: the metrics by method in the full and the dynamic region, other regions, and notes."""
-    methods = [method for method in _unique(rows, "method") if method != MASKS]
+    methods = [method for method in _unique(rows, "method") if method not in ESTIMATES]
     lines = []
     for region in ("full", "dynamic"):
         of_region = [row for row in rows if row["region"] == region]
@@ -100,7 +108,7 @@ def draw_table(rows: Sequence[Row], summaries: Summaries) -> str:
             *_camera_table(of_region, views, methods),
             "",
         ]
-    lines += _mask_lines(summaries)
+    lines += [*_mask_lines(summaries), *_depth_lines(summaries)]
     lines += ["Mean PSNR in dB by region, with its share of the frame; flicker in grey levels", ""]
     lines += [*_region_table(rows, summaries, methods), "", *_notes(summaries)]
     return "\n".join(lines)
@@ -147,6 +155,23 @@ def _mask_lines(summaries: Summaries) -> list[str]:
     )
 
 
+def _depth_lines(summaries: Summaries) -> list[str]:
+    """How far the workflow's depth lies from the true one, where somebody knows it."""
+    regions = dict.fromkeys(region for region, method, _ in summaries if method in DEPTHS)
+    if not regions:
+        return []
+    lines = ["Depth of the workflow against the true one: share of |found - true| / true", ""]
+    lines += _header(["depth", "region", *(name for name, _ in DEPTH_METRICS.values())])
+    for method, label in DEPTHS.items():
+        for region in regions:
+            cells = [label, REGIONS.get(region, region)]
+            for metric, (_, form) in DEPTH_METRICS.items():
+                found, _ = summaries.get((region, method, metric), (None, ""))
+                cells.append("-" if found is None else form.format(found.mean))
+            lines.append(_line(cells))
+    return [*lines, ""]
+
+
 def _camera_table(rows: Sequence[Row], views: Sequence[str], methods: Sequence[str]) -> list[str]:
     lines = _header(["method", *views])
     for method in methods:
@@ -187,7 +212,7 @@ def _notes(summaries: Summaries) -> list[str]:
     """The conventions, and each reason or remark once with the methods or the metric that it is about."""
     about: dict[str, dict[str, None]] = {}
     for (region, method, metric), (found, note) in summaries.items():
-        if note and region == "full":
+        if note and region == "full" and method not in ESTIMATES:
             is_of_metric = found is None and metric != "psnr_db"
             name = METRICS[metric][0] if is_of_metric else LABELS.get(method, method)
             about.setdefault(note, {})[name] = None

@@ -7,6 +7,6 @@ from fourd.fuse.geometry import PairFrame
 from fourd.fuse.options import ESTIMATES, FuseOptions
 from fourd.fuse.view import FusedView, fuse_view
 
-STAGE_VERSION = 3
+STAGE_VERSION = 4
 
 __all__ = ["ESTIMATES", "STAGE_VERSION", "FuseOptions", "FusedView", "PairFrame", "fuse_view"]

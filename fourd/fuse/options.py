@@ -40,6 +40,8 @@ class FuseOptions:
         more often than not
     footprint: half the side of the square patch that one source pixel covers, source px
     num_sources: original images blended per pixel
+    visibility: whether the consensus takes a sample of fewer pairs where two cameras or more confirm it and
+        none sees through it
     memory_mb: bound for the cost volume of a tile and the disparities kept, each
     """
 
@@ -49,6 +51,7 @@ class FuseOptions:
     max_front: float = 1.0
     footprint: float = 0.6
     num_sources: int = 4
+    visibility: bool = True
     memory_mb: int = 512
 
 
@@ -57,6 +60,7 @@ class FusionRules:
     """What the reduction of one view needs, after capping to what the scene can give.
 
     farthest_min_pairs: pairs that have to agree with the farthest; 1 is the plain farthest
+    estimates: to be reduced;  visibility: whether cameras are asked about the consensus afterwards
     """
 
     tolerance: float
@@ -65,6 +69,7 @@ class FusionRules:
     max_front: float
     farthest_min_pairs: int
     estimates: tuple[str, ...]
+    visibility: bool = False
 
     def numbers(self) -> np.ndarray:
         """(3,) int64 as the kernels read them."""

@@ -23,6 +23,7 @@ from fourd.fuse.options import (
     FusionRules,
 )
 from fourd.fuse.reference import ReferenceBackend
+from fourd.fuse.visibility import apply_visibility
 
 _HULL_OPTIONS = HullOptions()
 
@@ -85,14 +86,16 @@ def fuse_view(
     """
     _check(target, images, cameras, estimates)
     wanted = [e for e in ESTIMATES if e in estimates]
-    min_pairs = max(1, min(options.min_pairs, len(pairs)))
+    has_visibility = options.visibility and "consensus" in wanted
     rules = FusionRules(
         options.tolerance,
-        min_pairs,
+        max(1, min(options.min_pairs, len(pairs))),
         options.min_cameras,
         options.max_front,
         farthest_min_pairs,
-        tuple(wanted),
+        # What the visibility test chooses among, whether it is coloured or not.
+        (*wanted, *ESTIMATES[:3]) if has_visibility else tuple(wanted),
+        has_visibility,
     )
     width, height = target.size
     result = _Arrays(wanted, height, width)
@@ -111,7 +114,7 @@ def fuse_view(
             status = "ok"
     return FusedView(
         result.rgb, result.valid, result.depths, result.counts[0], result.counts[1], result.source,
-        result.depth_source, tuple(images), len(pairs), min_pairs, num_points, status,
+        result.depth_source, tuple(images), len(pairs), rules.min_pairs, num_points, status,
     )  # fmt: skip
 
 
@@ -143,6 +146,11 @@ def _fuse_tile(
         num_points += backend.layer(index, maps_of_pair(pair, target), rows)
         masks.append(_camera_mask(pair, names))
     chosen, cameras, counts = backend.reduce(np.array(masks, dtype=np.uint64), rules, rows)
+    if rules.visibility:
+        apply_visibility(target, pairs, names, rows[0], chosen, cameras, counts)
+    for index, estimate in enumerate(ESTIMATES):
+        if estimate not in result.rgb:
+            chosen[index] = -1
     rgb, source = backend.colours(chosen, cameras, rows[0])
     part = slice(*rows)
     result.counts[:, part] = counts

@@ -20,7 +20,7 @@ from fourd.plan.files import (
     survey_to_dict,
 )
 from fourd.plan.options import PlanOptions
-from fourd.plan.outline import list_jobs
+from fourd.plan.outline import list_jobs, list_viewer
 from fourd.plan.show import check_document, describe, make_document
 from fourd.plan.work import OK, Survey, choose_work
 
@@ -60,6 +60,7 @@ def run_probe(output: Path) -> None:
 
 def run_show(
     outline: dict[str, Any],
+    lattice: dict[str, Any] | None,
     budget: dict[str, Any] | None,
     options: PlanOptions,
     survey_path: Path,
@@ -72,12 +73,17 @@ def run_show(
     survey = read_survey(survey_path)
     work = choose_work(survey, outline["pairs"], options)
     jobs = list_jobs(outline, survey, work)
-    costs = forecast(jobs, outline["size"], read_machine_file(machine_path), read_finished(benchmarks))
+    machine, finished = read_machine_file(machine_path), read_finished(benchmarks)
+    costs = forecast(jobs, outline["size"], machine, finished)
+    viewer = None
+    if lattice is not None:
+        own = forecast(list_viewer(outline, lattice, work), lattice["size"], machine, finished)
+        viewer = {"size_mb": lattice["size_mb"], "forecast": own}
     results = cameras_path.parent.parent
     disk_now = sum(path.stat().st_size for path in results.rglob("*") if path.is_file())
     earlier = read_json(output) if output.is_file() else None
     left_out = read_json(cameras_path)["left_out"]
-    document = make_document(outline, survey, work, left_out, budget, costs, disk_now, earlier)
+    document = make_document(outline, survey, work, left_out, budget, costs, viewer, disk_now, earlier)
     check_document(document)
     write_json(output, document)
     print(describe(document))
@@ -103,6 +109,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     probe = commands.add_parser("probe", help="how fast this machine is")
     show = commands.add_parser("show", help="decisions and forecast")
     show.add_argument("--outline", required=True, help="the scene's jobs as JSON")
+    show.add_argument("--lattice", default="null", help="views and moments of the viewer, as JSON")
     show.add_argument("--budget", default="null", help="what a budget left, as JSON")
     show.add_argument("--survey", type=Path, required=True, help="plan/survey.json")
     show.add_argument("--machine", type=Path, required=True, help="machine/speed.json")
@@ -120,6 +127,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     else:
         run_show(
             parse_json(args.outline),
+            parse_json(args.lattice),
             parse_json(args.budget),
             options_from_args(PlanOptions, args),
             args.survey,

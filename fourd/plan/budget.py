@@ -8,10 +8,10 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fourd.plan.cost import Machine, forecast
+from fourd.plan.cost import GPU_RULES, Machine, forecast
 from fourd.plan.files import read_machine_file, read_survey
 from fourd.plan.options import PlanOptions, options_from_section
-from fourd.plan.outline import list_jobs, list_training, steps_per_epoch
+from fourd.plan.outline import list_jobs, list_rendering, list_training, steps_per_epoch
 from fourd.plan.work import Survey, choose_work, rank_pairs
 
 # Expected loss, dB of PSNR, each from a table of docs/performance.md; straight lines between the rows, level
@@ -21,6 +21,8 @@ from fourd.plan.work import Survey, choose_work, rank_pairs
 PAIRS_DB = ((0.3, 1.7), (0.5, 0.74), (0.75, 0.11), (1.0, 0.0))
 SAMPLES_DB = ((1, 3.7), (3, 0.35), (5, 0.35), (7, 0.0))
 STEPS_GAIN_DB = ((0, 0.0), (635, 1.42), (1889, 1.69))
+# Each of the coarser levels, which fill holes only. Assumed, not measured: no event of 540 lines was trained.
+LEVEL_DB = 0.1
 SHARES_OF_PAIRS = (1.0, 0.75, 0.5, 0.3)
 SHARES_OF_EPOCHS = (1.0, 0.5, 0.25, 0.1)
 NUMBERS_OF_SAMPLES = (7, 5, 3, 1)
@@ -30,12 +32,14 @@ NUMBERS_OF_SAMPLES = (7, 5, 3, 1)
 class Reduction:
     """What a budget leaves. max_pairs: None for all;  loss_db: expected, against the work without a budget
 
+    num_levels: of the composition, the coarsest are dropped
     kept: intermediate files that stay on the disk to the end
     minutes, peak_bytes: forecast of a run from nothing;  fits: whether that is within the budget
     """
 
     max_pairs: int | None
     num_samples: int
+    num_levels: int
     epochs: int
     kept: tuple[str, ...]
     loss_db: float
@@ -57,12 +61,12 @@ def fit_budget(
 
     outline: of `describe_scene` for the configured work;  survey, options: as `choose_work`
     minutes: of a run from nothing on all cores of the machine;  disk_gb: at the fullest moment
-    fixed: of `max_pairs`, `num_samples` and `epochs` those that were asked for and stay
+    fixed: of `max_pairs`, `num_samples`, `max_levels` and `epochs` those that were asked for and stay
     The same arguments give the same result: finished jobs do not count.
     """
     found = []
     matched = choose_work(survey, outline["pairs"], options).matched
-    epochs_choices = _numbers("epochs", outline["training"]["epochs"], _shares(outline), fixed)
+    network_costs = _price_network(outline, machine, fixed)
     kept_choices = [tuple(outline["kept"])] if disk_gb is None else _kept(outline["kept"])
     for max_pairs, num_samples, kept in itertools.product(
         [None] if "max_pairs" in fixed else _numbers_of_pairs(survey, matched),
@@ -73,30 +77,46 @@ def fit_budget(
         limit = options if max_pairs is None else dataclasses.replace(options, max_pairs=max_pairs)
         work = choose_work(survey, outline["pairs"], limit)
         share = len(work.matched) / max(1, len(matched))
-        # Only the training depends on the epochs; all other jobs are priced once.
-        rest = [job for job in list_jobs(reduced, survey, work) if job.rule != "train_level"]
+        rest = [job for job in list_jobs(reduced, survey, work) if job.rule not in GPU_RULES]
         rest_cost = forecast(rest, outline["size"], machine, {})
-        for epochs in epochs_choices:
-            trained = {**reduced, "training": {**outline["training"], "epochs": epochs}}
-            training = forecast(list_training(trained), outline["size"], machine, {})
-            took = rest_cost["minutes"] + training["minutes"]
-            peak_bytes = rest_cost["peak_bytes"] + training["peak_bytes"]
+        for (num_levels, epochs), network in network_costs.items():
+            took = rest_cost["minutes"] + network["minutes"]
+            peak_bytes = rest_cost["peak_bytes"] + network["peak_bytes"]
             fits = took <= (minutes or math.inf) and peak_bytes <= (disk_gb or math.inf) * 1e9
-            loss_db = expected_loss(outline, share, num_samples, epochs)
-            found.append(Reduction(max_pairs, num_samples, epochs, kept, loss_db, took, peak_bytes, fits))
+            loss_db = expected_loss(outline, share, num_samples, num_levels, epochs)
+            numbers = (max_pairs, num_samples, num_levels, epochs)
+            found.append(Reduction(*numbers, kept, loss_db, took, peak_bytes, fits))
     fitting = [reduction for reduction in found if reduction.fits]
     if fitting:
         return min(fitting, key=lambda r: (r.loss_db, -len(r.kept), r.minutes))
     return min(found, key=lambda r: (r.minutes, r.peak_bytes))
 
 
-def expected_loss(outline: Mapping[str, Any], share_of_pairs: float, num_samples: int, epochs: int) -> float:
+def _price_network(
+    outline: Mapping[str, Any], machine: Machine, fixed: Collection[str]
+) -> dict[tuple[int, int], dict[str, Any]]:
+    """(levels, epochs) -> cost of training and rendering, which depend on nothing else that is reduced."""
+    training = outline["training"]
+    levels = _numbers("max_levels", outline["num_levels"], range(outline["num_levels"] - 1, 0, -1), fixed)
+    epochs = _numbers("epochs", training["epochs"], _shares(outline), fixed)
+    costs = {}
+    for key in itertools.product(levels, epochs):
+        reduced = {**outline, "num_levels": key[0], "training": {**training, "epochs": key[1]}}
+        jobs = [*list_training(reduced), *list_rendering(reduced)]
+        costs[key] = forecast(jobs, outline["size"], machine, {})
+    return costs
+
+
+def expected_loss(
+    outline: Mapping[str, Any], share_of_pairs: float, num_samples: int, num_levels: int, epochs: int
+) -> float:
     """dB of PSNR that reduced work is expected to lose against the configured one."""
     per_epoch = steps_per_epoch(outline)
     wanted = outline["training"]["epochs"]
     steps = interpolate(STEPS_GAIN_DB, wanted * per_epoch) - interpolate(STEPS_GAIN_DB, epochs * per_epoch)
     samples = interpolate(SAMPLES_DB, num_samples) - interpolate(SAMPLES_DB, outline["num_samples"])
-    return interpolate(PAIRS_DB, share_of_pairs) + samples + steps
+    levels = LEVEL_DB * (outline["num_levels"] - num_levels)
+    return interpolate(PAIRS_DB, share_of_pairs) + samples + levels + steps
 
 
 def interpolate(curve: Sequence[tuple[float, float]], at: float) -> float:
@@ -179,14 +199,16 @@ def apply_reduction(config: Mapping[str, Any], reduction: Reduction) -> dict[str
         "plan": limited,
         "background": config["background"] | {"num_samples": reduction.num_samples},
         "composition": config["composition"] | {"epochs": reduction.epochs},
+        "max_levels": min(config["max_levels"], reduction.num_levels),
     }
 
 
 def fixed_keys(given: Mapping[str, Any]) -> set[str]:
     """Of the numbers that a budget may lower those that a person has given."""
     places = {"max_pairs": "plan", "num_samples": "background", "epochs": "composition"}
-    return {
+    keys = {
         key
         for key, section in places.items()
         if isinstance(given.get(section), Mapping) and key in given[section]
     }
+    return keys | ({"max_levels"} & given.keys())

@@ -30,8 +30,8 @@ class Rate:
 
 
 # Two runs of the embedded event from its phones, 480x270, 7 + 2 cameras, 30 frames, each fitted by a line
-# (`python -m benches.plan` checks them). Units: `Job.amount` of fourd/plan/outline.py, mostly frames times
-# millions of pixels.
+# (`python -m benches.plan` checks them); training from 66 steps beside the probe of the machine.
+# Units: `Job.amount` of fourd/plan/outline.py, mostly frames times millions of pixels.
 RATES = {
     "probe_camera": Rate(0.45, 0.0),
     "listen": Rate(1.2, 0.1, base_mb=200),
@@ -52,13 +52,23 @@ RATES = {
     "fuse_training": Rate(0.9, 0.1, COMPILED, base_mb=330, mb_per_mpx=400),
     "fuse_foreground": Rate(0.9, 0.06, COMPILED, base_mb=330, mb_per_mpx=400),
     "estimate_background": Rate(1.2, 0.049, COMPILED, base_mb=550, mb_per_mpx=800),
-    "train_level": Rate(4.0, 1.15, NETWORK, base_mb=400, mb_per_mpx=3000),
+    "train_level": Rate(6.0, 3.0, NETWORK, base_mb=400, mb_per_mpx=3000),
     "render_frames": Rate(1.3, 1.0, base_mb=320, mb_per_mpx=600),
     "encode_film": Rate(0.35, 0.04, base_mb=80, mb_per_mpx=150),
-    "evaluate_camera": Rate(1.0, 4.8, base_mb=200, mb_per_mpx=600),
+    "evaluate_camera": Rate(1.0, 6.0, base_mb=200, mb_per_mpx=600),
+    "find_people": Rate(3.0, 0.4, base_mb=500),
     "collect_metrics": Rate(1.0, 0.0, base_mb=170),
 }
-GPU_RULES = ("train_level", "render_frames")
+# The viewer's page takes the same steps as a film, at other places; its own two from one run of 13 views.
+RATES |= {
+    "place_lattice": RATES["place_view"],
+    "fuse_lattice": RATES["fuse_foreground"],
+    "estimate_lattice_background": RATES["estimate_background"],
+    "render_lattice": RATES["render_frames"],
+    "map_lattice": Rate(0.2, 0.03),
+    "viewer_page": Rate(0.5, 0.08),
+}
+GPU_RULES = ("train_level", "render_frames", "render_lattice")
 
 
 @dataclasses.dataclass(frozen=True)

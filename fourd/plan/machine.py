@@ -12,8 +12,9 @@ from fourd.cli import set_num_threads
 from fourd.matchers.pyramid import PyramidMatcher
 from fourd.plan.cost import COMPILED, NETWORK, VISION
 
-# Processor seconds of the samples on the machine on which the rates were measured.
-REFERENCE_S = {COMPILED: 0.085, VISION: 0.088, NETWORK: 0.05}
+# Processor seconds of the samples on the machine on which the rates were measured; the network's within
+# the same minutes as the training that its rate is from, for both are slower beside other work.
+REFERENCE_S = {COMPILED: 0.085, VISION: 0.088, NETWORK: 0.106}
 REPEATS = 3
 SIZE = (480, 270)
 SEARCH_PX = (0.0, 300.0)

@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import itertools
+import math
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
@@ -14,6 +15,11 @@ SWEEP_FACTOR = 12.0
 """Work of a pair swept by planes over that of a planar one (docs/performance.md: ten to twenty times)."""
 WIDE_SEARCH = 320.0
 """Million pixels times disparities beyond which the matcher starts at a quarter of the size."""
+TRAINING_KEYS = ("num_filters", "crop", "epochs", "min_scale", "max_scale")
+NETWORKS_WORK = 0.2
+"""Work on a frame that networks score, in units of evaluate_camera, whatever the frame's size."""
+NUM_SCALES = 32
+"""Places at which the size of a training sample is averaged."""
 # Bytes per pixel of what is written (docs/formats.md): a pair's disparities and confidences, an estimate
 # with its mask and what goes with all of them, a background's arrays, a PNG.
 PAIR_BYTES, ESTIMATE_BYTES, DEPTH_BYTES, BACKGROUND_BYTES, PNG_BYTES = 6, 4, 8, 14, 1.7
@@ -64,7 +70,8 @@ def describe_scene(
         "cameras_are_given": bool(scene.calibration),
         "num_levels": num_levels(scene, config),
         "num_samples": min(config["background"]["num_samples"], scene.num_frames),
-        "training": {key: config["composition"][key] for key in ("num_filters", "crop", "epochs")},
+        "training": {key: config["composition"][key] for key in TRAINING_KEYS},
+        "scores": {key: bool(config["evaluate"][key]) for key in ("humans", "lpips_weights")},
         "num_estimates": 1 if config["composition"]["streams"] == "paper" else 4,
         "views": views,
         # Numbers of the scene's chunks that any view shows.
@@ -87,6 +94,7 @@ def list_jobs(outline: Mapping[str, Any], survey: Survey | None, work: Work) -> 
         *_list_fusion(outline, work.matched if is_foreground else []),
         *_list_backgrounds(outline, work.matched),
         *list_training(outline),
+        *list_rendering(outline),
         *_list_films(outline),
     ]
 
@@ -197,13 +205,23 @@ def _list_backgrounds(outline: Mapping[str, Any], matched: Collection[str]) -> I
 
 def list_training(outline: Mapping[str, Any]) -> list[Job]:
     """The jobs that train, one per level."""
-    training, jobs = outline["training"], []
-    steps = training["epochs"] * steps_per_epoch(outline)
+    jobs: list[Job] = []
+    steps = outline["training"]["epochs"] * steps_per_epoch(outline)
     for mpx, width in _levels(outline):
-        crop_mpx = mpx if training["crop"] is None else min(mpx, training["crop"] ** 2 / 1e6)
-        work = steps * network_work(crop_mpx, width)
+        work = steps * network_work(_mean_sample(outline, mpx), width)
         jobs.append(Job("train_level", (str(len(jobs)),), work, 1e6 * width**2 / 6))
     return jobs
+
+
+def _mean_sample(outline: Mapping[str, Any], mpx: float) -> float:
+    """Millions of pixels of a training sample at a level of `mpx`: made smaller by chance, then cropped."""
+    training = outline["training"]
+    shrink = (1e6 * mpx / (outline["size"][0] * outline["size"][1])) ** 0.5
+    low, high = training["min_scale"], training["max_scale"]
+    crop = math.inf if training["crop"] is None else training["crop"]
+    scales = (min(1.0, low + (i + 0.5) / NUM_SCALES * (high - low)) for i in range(NUM_SCALES))
+    areas = (math.prod(min(crop, scale * shrink * side) for side in outline["size"]) for scale in scales)
+    return sum(areas) / NUM_SCALES / 1e6
 
 
 def _levels(outline: Mapping[str, Any]) -> list[tuple[float, int]]:
@@ -215,23 +233,67 @@ def _levels(outline: Mapping[str, Any]) -> list[tuple[float, int]]:
     ]
 
 
+def list_rendering(outline: Mapping[str, Any]) -> list[Job]:
+    """The jobs that apply the network, one per film or held-out camera and chunk."""
+    num_bytes, per_frame = _mpx(outline) * 1e6 * PNG_BYTES, _rendering_work(outline, 1.0)
+    return [
+        Job("render_frames", (name, chunk), count * per_frame, count * num_bytes)
+        for name, view in outline["views"].items()
+        if view["role"] != "input"
+        for chunk, count in count_frames(outline, name).items()
+    ]
+
+
+def _rendering_work(outline: Mapping[str, Any], share: float) -> float:
+    """Work of a picture with that share of the films' pixels.
+
+    Coarser levels only fill holes: they run on few frames, and are counted as if on all.
+    """
+    return sum(network_work(share * mpx, width) for mpx, width in _levels(outline))
+
+
+def list_viewer(outline: Mapping[str, Any], lattice: Mapping[str, Any], work: Work) -> list[Job]:
+    """The jobs of the viewer's page beyond those of the films.
+
+    lattice: `views`, `num_moments` and `size` of its pictures, (width, height) px, as the viewer chose them
+    """
+    matched = work.matched if work.foreground == OK else []
+    mpx, moments = math.prod(lattice["size"]) / 1e6, lattice["num_moments"]
+    per_frame = _rendering_work(outline, mpx / _mpx(outline))
+    jobs = []
+    for view in lattice["views"]:
+        jobs.append(Job("place_lattice", (view,)))
+        for chunk in chunk_names(moments, outline["chunk_frames"]):
+            words, count = (view, chunk), len(frames_of_chunk(chunk))
+            background = outline["num_samples"] * mpx * (4 + len(work.matched))
+            num_bytes = count * mpx * 1e6 * (4 * ESTIMATE_BYTES + DEPTH_BYTES)
+            jobs += [
+                Job("fuse_lattice", words, count * mpx * len(matched), num_bytes, False),
+                Job("estimate_lattice_background", words, background, mpx * 1e6 * BACKGROUND_BYTES, False),
+                Job("render_lattice", words, count * per_frame, count * mpx * 1e6 * PNG_BYTES),
+                Job("map_lattice", words, count * mpx),
+            ]
+    pictures = moments * (len(lattice["views"]) + len(outline["cameras"]))
+    return [*jobs, Job("viewer_page", (), pictures * mpx, lattice["size_mb"] * 1e6)]
+
+
 def _list_films(outline: Mapping[str, Any]) -> Iterator[Job]:
     """Films and scores."""
     full = _mpx(outline)
-    # Coarser levels only fill holes: they run on few frames, and are counted as if on all.
-    per_frame = sum(network_work(mpx, width) for mpx, width in _levels(outline))
     for name, view in outline["views"].items():
         if view["role"] == "input":
             continue
-        for chunk, count in count_frames(outline, name).items():
-            yield Job("render_frames", (name, chunk), count * per_frame, count * full * 1e6 * PNG_BYTES)
         count = view["num_frames"]
         if view["role"] == "film":
             yield Job("encode_film", (name,), count * full, count * full * 1e5)
         else:
-            yield Job("evaluate_camera", (name,), count * full)
+            amount = full + (NETWORKS_WORK if outline["scores"]["lpips_weights"] else 0.0)
+            yield Job("evaluate_camera", (name,), count * amount)
     if outline["heldout"]:
         yield Job("collect_metrics")
+        if outline["scores"]["humans"]:
+            moments = max(outline["views"][cam]["num_frames"] for cam in outline["heldout"])
+            yield Job("find_people", (), moments * len(outline["inputs"]))
 
 
 def count_frames(outline: Mapping[str, Any], view: str) -> dict[str, int]:

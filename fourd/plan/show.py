@@ -56,8 +56,7 @@ def decide_stages(
         reason = f"the films have {lines} lines" if lines < 0.75 * LINES_OF_LEVELS[level] else "max_levels"
         add("composition", False, f"level of {LINES_OF_LEVELS[level]} lines", reason, "max_levels")
     epochs, levels = outline["training"]["epochs"], outline["num_levels"]
-    word = "level" if levels == 1 else "levels"
-    add("composition", True, f"{levels} {word}, {epochs} epochs", None, "composition.epochs")
+    add("composition", True, f"{_count_levels(levels)}, {epochs} epochs", None, "composition.epochs")
     heldout = len(outline["heldout"])
     reason = None if heldout else "no camera is held out"
     add("evaluate", bool(heldout), f"scores of {heldout} held-out cameras", reason, "heldout")
@@ -71,10 +70,14 @@ def make_document(
     left_out: Mapping[str, str],
     budget: Mapping[str, Any] | None,
     costs: Mapping[str, Any],
+    viewer: Mapping[str, Any] | None,
     disk_now_bytes: int,
     earlier: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """plan/plan.json. earlier: the one that is there, whose first forecast of the same work is kept."""
+    """plan/plan.json. earlier: the one that is there, whose first forecast of the same work is kept.
+
+    viewer: `size_mb` of the page and the `forecast` of its own jobs, None where it is not known
+    """
     decisions = decide_stages(outline, survey, work, left_out)
     pairs = survey_to_dict(survey)["pairs"]
     document = {
@@ -85,6 +88,7 @@ def make_document(
         "disk_now_bytes": disk_now_bytes,
         "forecast": costs,
         "first_forecast": costs,
+        "viewer": viewer,
     }
     if earlier and earlier.get("decisions") == decisions and earlier["forecast"]["jobs"] == costs["jobs"]:
         document["first_forecast"] = earlier["first_forecast"]
@@ -128,7 +132,24 @@ def describe(document: Mapping[str, Any]) -> str:
         f"  disk: {show_size(document['disk_now_bytes'])} now, {show_size(costs['peak_bytes'])} at the "
         f"fullest, {show_size(costs['end_bytes'])} at the end",
     ]
-    return "\n".join([*lines, *_describe_budget(document["budget"]), ""])
+    return "\n".join(
+        [*lines, *_describe_budget(document["budget"]), *_describe_viewer(document["viewer"]), ""]
+    )
+
+
+def _describe_viewer(viewer: Mapping[str, Any] | None) -> list[str]:
+    if viewer is None:
+        return []
+    costs = viewer["forecast"]
+    return [
+        f"  not counted above: `snakemake viewer`, a page of {show_size(viewer['size_mb'] * 1e6)} by "
+        f"{costs['jobs_left']} of {costs['jobs']} more jobs, {costs['cpu_minutes']:.1f} processor minutes, "
+        f"{show_size(costs['end_bytes'])} on the disk; edits, exports and the report, which are not forecast"
+    ]
+
+
+def _count_levels(number: int) -> str:
+    return f"{number} level" if number == 1 else f"{number} levels"
 
 
 def _describe_budget(budget: Mapping[str, Any] | None) -> list[str]:
@@ -141,8 +162,9 @@ def _describe_budget(budget: Mapping[str, Any] | None) -> list[str]:
     verdict = "fits" if budget["fits"] else "does not fit even with the least work"
     return [
         f"  budget of {' and '.join(asked)} {verdict}: {pairs} pairs, {budget['num_samples']} moments for "
-        f"the background, {budget['epochs']} epochs; from nothing {budget['forecast_minutes']:.1f} minutes "
-        f"and {show_size(budget['peak_bytes'])}; expected to lose {budget['loss_db']:.1f} dB"
+        f"the background, {_count_levels(budget['num_levels'])}, {budget['epochs']} epochs; from nothing "
+        f"{budget['forecast_minutes']:.1f} minutes and {show_size(budget['peak_bytes'])}; expected to lose "
+        f"{budget['loss_db']:.1f} dB"
     ]
 
 

@@ -7,7 +7,7 @@ server and no other file. What is not there is said on the page with its reason.
 
 import dataclasses
 
-STAGE_VERSION = 2
+STAGE_VERSION = 3
 
 
 @dataclasses.dataclass(frozen=True)

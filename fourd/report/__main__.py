@@ -13,7 +13,7 @@ from fourd.errors import InputError
 from fourd.io import write_csv, write_json, write_text
 from fourd.report import ReportOptions
 from fourd.report.document import Sources, check_document, collect_document
-from fourd.report.page import draw_page, film_players, read_evidence, read_validation
+from fourd.report.page import draw_page, edit_shows, film_players, read_evidence, read_validation
 from fourd.report.pictures import collect_pictures
 
 logger = logging.getLogger(__name__)
@@ -23,10 +23,12 @@ def run(sources: Sources, output: Path, options: ReportOptions) -> None:
     """Write index.html, report.json and the data of its tables as CSV. Raises InputError."""
     document, scores = collect_document(sources)
     check_document(document)
-    shows = collect_pictures(sources.results, sources.views, scores, options)
-    films = film_players(sources.results, sources.views, output, options.picture_px)
-    evidence, validation = read_evidence(sources.results), read_validation(sources.results)
-    page = draw_page(document, scores, shows, evidence, films, validation, options.picture_px)
+    results, current, width = sources.results, sources.current, options.picture_px
+    shows = collect_pictures(results, current, scores, options)
+    films = film_players(results, current, output, width)
+    edits = edit_shows(results, current, output, width)
+    evidence, validation = read_evidence(results), read_validation(results, current)
+    page = draw_page(document, scores, shows, evidence, films, edits, validation, width)
     write_json(output / "report.json", document)
     for name, rows in (
         ("scores", document["scores"]["rows"]),
@@ -65,6 +67,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--stability", type=Path, help="stability.csv, if the suite has been run")
     parser.add_argument("--benches", type=Path, help="folder of sweeps, if any have been run")
     parser.add_argument("--settings", help="the configuration as JSON, to be shown")
+    parser.add_argument("--num-levels", type=int, help="levels of the composition that the scene has")
+    parser.add_argument("--edits", nargs="*", help="edits that the scene has")
     parser.add_argument("--output", type=Path, required=True, help="folder of the page")
     cli.add_options(parser, ReportOptions)
     args = parser.parse_args(argv)
@@ -72,7 +76,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     settings = parse_settings(args.settings)
     options = cli.options_from_args(ReportOptions, args)
     truth = Path(options.truth) if options.truth else None
-    sources = Sources(args.results, args.benchmarks, args.stability, args.benches, settings, truth)
+    files = (args.results, args.benchmarks, args.stability, args.benches)
+    sources = Sources(*files, settings, truth, args.num_levels, args.edits)
     run(sources, args.output, options)
 
 

@@ -1,16 +1,19 @@
 """All figures of the page as one JSON object, checked against its schema before it is written."""
 
 import dataclasses
+import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 
-from fourd.evaluate.score import MASKS
+from fourd.evaluate.depth import CONSENSUS, SURFACE
+from fourd.evaluate.score import ESTIMATES, MASKS
 from fourd.io import SCHEMA_VERSION
-from fourd.report import costs, environment, extras, progress, scene
+from fourd.report import costs, environment, extras, films, progress, scene
+from fourd.report.current import Current, read_current
 from fourd.report.scores import Scores, add_summary, read_notes, read_scores, summarize
 from fourd.report.truth import collect_truth
 from fourd.sfm import read_cameras
@@ -23,6 +26,7 @@ class Sources:
     """Where the figures come from. results, benchmarks: folders of one scene; the others may be missing.
 
     settings: the configuration of the run with all defaults filled in;  truth: true films (`truth`)
+    num_levels, edits: how many levels of the composition and which edits the scene has, None if not known
     """
 
     results: Path
@@ -31,12 +35,13 @@ class Sources:
     benches: Path | None = None
     settings: Mapping[str, Any] | None = None
     truth: Path | None = None
+    num_levels: int | None = None
+    edits: Sequence[str] | None = None
 
-    @property
-    def views(self) -> list[str]:
-        """Names of the views that the scene has now."""
-        trajectories = None if self.settings is None else self.settings.get("trajectories")
-        return scene.current_views(self.results, trajectories)
+    @functools.cached_property
+    def current(self) -> Current:
+        """What belongs to the scene as it is now."""
+        return read_current(self.results, self.settings, self.num_levels, self.edits)
 
 
 def collect_document(sources: Sources) -> tuple[dict[str, Any], Scores | None]:
@@ -47,35 +52,39 @@ def collect_document(sources: Sources) -> tuple[dict[str, Any], Scores | None]:
     results = sources.results
     # Checks every camera, so that a damaged file is named before anything is drawn from it.
     read_cameras(results / "sfm" / "cameras.json")
-    metrics = results / "evaluate" / "metrics.csv"
-    scores = read_scores(metrics) if metrics.is_file() else None
+    current, metrics = sources.current, results / "evaluate" / "metrics.csv"
+    scores = read_scores(metrics, current.heldout) if metrics.is_file() else None
     rows = summarize(scores, ("region", "region_source", "method", "metric")) if scores else []
     add_summary(rows, results / "evaluate" / "summary.csv")
     masks = {row["metric"]: row["mean"] for row in rows if row["method"] == MASKS}
-    rows = [row for row in rows if row["method"] != MASKS]
+    depths = [row for row in rows if row["method"] in (CONSENSUS, SURFACE)]
+    rows = [row for row in rows if row["method"] not in ESTIMATES]
     by_view = summarize(scores, ("view", "region", "method", "metric")) if scores else []
-    jobs = costs.read_jobs(sources.benchmarks)
-    pairs, views = scene.collect_pairs(results), sources.views
+    jobs = [job for job in costs.read_jobs(sources.benchmarks) if current.has_job(job)]
+    pairs = scene.collect_pairs(results, current)
     document = {
         "schema_version": SCHEMA_VERSION,
         **scene.collect_scene(results),
-        "map": scene.collect_map(results, views),
+        "map": scene.collect_map(results, current.views),
         "truth": collect_truth(results, sources.truth),
         "pairs": pairs,
         "scores": {
             "rows": rows,
-            "by_view": [row for row in by_view if row["method"] != MASKS],
+            "by_view": [row for row in by_view if row["method"] not in ESTIMATES],
             "masks": masks,
-            "notes": read_notes(results / "evaluate" / "table.md"),
+            "depths": depths,
+            "notes": read_notes(results / "evaluate" / "table.md") if rows else [],
         },
-        "renders": scene.collect_renders(results, views),
-        "training": progress.collect_training(results),
+        "renders": scene.collect_renders(results, current),
+        "films": films.collect_films(results, current),
+        "edits": films.collect_edits(results, current),
+        "training": progress.collect_training(results, current),
         "costs": costs.collect_costs(results, jobs),
         "forecast": costs.collect_forecast(results / "plan" / "plan.json", jobs),
         "stability": extras.collect_stability(sources.stability),
         "benches": extras.collect_benches(sources.benches),
         "ablations": extras.collect_ablations(results / "ablations"),
-        "left_out": scene.collect_left_out(results, views, pairs, rows),
+        "left_out": scene.collect_left_out(results, current, pairs, rows),
         "environment": environment.collect_environment(sources.settings),
     }
     heldout = [camera["name"] for camera in document["cameras"] if camera["role"] == "held out"]

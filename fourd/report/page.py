@@ -9,9 +9,12 @@ import numpy as np
 
 from fourd.io import read_image
 from fourd.render import list_frames
-from fourd.report.html import Markup, figure, join, tag
+from fourd.report.current import Current
+from fourd.report.films import edit_pictures, edited_views
+from fourd.report.html import Child, Markup, figure, join, tag
 from fourd.report.numbers import plural, show, show_bytes, show_seconds
 from fourd.report.page_costs import cost_chapter, origin_chapter, proof_chapter
+from fourd.report.page_films import film_chapter
 from fourd.report.page_pictures import picture_chapter
 from fourd.report.page_scene import filmed, left_out_chapter, pair_chapter
 from fourd.report.page_scores import progress_chapter, score_chapter
@@ -28,6 +31,7 @@ CHAPTERS = {
     "filmed": "Footage",
     "pairs": "Pairs",
     "pictures": "Pictures",
+    "films": "Films",
     "scores": "Scores",
     "progress": "Error against time",
     "costs": "Cost",
@@ -48,11 +52,12 @@ def draw_page(
     shows: Sequence[FrameShow],
     evidence: Sequence[tuple[str, np.ndarray]],
     films: Sequence[Markup],
+    edits: Sequence[Markup],
     validation: Sequence[tuple[str, np.ndarray]],
     picture_px: int,
 ) -> str:
     """The whole HTML file. evidence, validation: (sentence, picture) of the clocks and of training;
-    films: players.
+    films, edits: players and pictures.
     """
     scene = document["scene"]
     cameras = document["cameras"]
@@ -74,7 +79,8 @@ def draw_page(
             "main",
             filmed(document, [(text, data_uri(image, EVIDENCE_PX)) for text, image in evidence]),
             pair_chapter(document["pairs"]),
-            picture_chapter(shows, picture_px, films),
+            picture_chapter(shows, picture_px),
+            film_chapter(document, films, edits),
             score_chapter(document, scores),
             progress_chapter(document, [(text, data_uri(image, EVIDENCE_PX)) for text, image in validation]),
             cost_chapter(document),
@@ -122,23 +128,54 @@ def read_evidence(results: Path) -> list[tuple[str, np.ndarray]]:
     return [(text, read_image(path)) for path, text in paths.items() if path.is_file()]
 
 
-def read_validation(results: Path) -> list[tuple[str, np.ndarray]]:
+def read_validation(results: Path, current: Current) -> list[tuple[str, np.ndarray]]:
     """What each level's network made of samples kept apart, at its last epoch, with what it shows."""
-    paths = sorted(results.glob("composition/*/validation.png"))
+    paths = sorted(results.glob("composition/[0-9]/validation.png"))
+    paths = [path for path in paths if current.has_level(path.parent.name)]
     text = "samples kept apart: what is pasted, what the network makes of it, what the camera filmed."
     return [(f"Level {path.parent.name}, {text}", read_image(path)) for path in paths]
 
 
-def film_players(results: Path, views: Sequence[str], output: Path, picture_px: int) -> list[Markup]:
+def film_players(results: Path, current: Current, output: Path, picture_px: int) -> list[Markup]:
     """Players of the scene's films, which stay beside the page; each shows one frame until it is started."""
     players = []
-    for path in (results / "render" / f"{name}.mp4" for name in views):
-        if not path.is_file():
-            continue
-        folders = sorted(p for p in (results / "render" / path.stem).glob("*") if p.is_dir())
-        images = list(list_frames(folders).values())
-        poster = data_uri(read_image(images[len(images) // 2]), picture_px) if images else None
-        source = Path(os.path.relpath(path, output)).as_posix()
-        video = tag("video", src=source, poster=poster, controls=True, preload="none")
-        players.append(figure(video, [tag("b", path.stem.replace("_", " ")), " ", f"film {path.name}"]))
+    for name in current.views:
+        path = results / "render" / f"{name}.mp4"
+        if path.is_file():
+            caption = [tag("b", name.replace("_", " ")), " ", f"film {path.name}"]
+            folders = current.chunks_in(results / "render" / name, name)
+            players.append(_player(path, folders, caption, output, picture_px))
     return players
+
+
+def _player(
+    path: Path, folders: Sequence[Path], caption: Sequence[Child], output: Path, picture_px: int
+) -> Markup:
+    images = list(list_frames(folders).values())
+    poster = data_uri(read_image(images[len(images) // 2]), picture_px) if images else None
+    source = Path(os.path.relpath(path, output)).as_posix()
+    return figure(tag("video", src=source, poster=poster, controls=True, preload="none"), caption)
+
+
+def edit_shows(results: Path, current: Current, output: Path, picture_px: int) -> list[Markup]:
+    """What every edit changed most in every view: the picture, where its pixels come from, and the film."""
+    shows = []
+    for folder, view in edited_views(results, current):
+        found = edit_pictures(folder, view, current)
+        if found is None:
+            continue
+        frame, edited, painted = found
+        title = f"{folder.parent.name.replace('_', ' ')}, {view}"
+        pictures = (
+            (edited, f"frame {frame}, edited"),
+            (painted, "where its pixels come from; grey is untouched"),
+        )
+        thumbs = [
+            figure(tag("img", src=data_uri(image, picture_px), alt=f"{title}: {text}"), text)
+            for image, text in pictures
+        ]
+        film = folder.with_suffix(".mp4")
+        folders = current.chunks_in(folder, view)
+        player = _player(film, folders, [f"film {film.name}"], output, picture_px) if film.is_file() else None
+        shows.append(tag("article", tag("h3", title), tag("div", thumbs, player, class_="grid")))
+    return shows

@@ -6,7 +6,7 @@ from fourd.report.html import Markup, figure, section, tag
 from fourd.report.pictures import FrameShow, Picture, data_uri
 
 
-def picture_chapter(shows: Sequence[FrameShow], picture_px: int, films: Sequence[Markup]) -> Markup:
+def picture_chapter(shows: Sequence[FrameShow], picture_px: int) -> Markup:
     """Chosen frames through all stages."""
     return section(
         "pictures",
@@ -15,7 +15,6 @@ def picture_chapter(shows: Sequence[FrameShow], picture_px: int, films: Sequence
         "differ at edges only, and the error is black but for fine texture.",
         [_frame(shown, picture_px) for shown in shows]
         or tag("p", "No frame has been rendered yet.", class_="none"),
-        [tag("h3", "Films"), tag("div", films, class_="films")] if films else None,
     )
 
 

@@ -1,11 +1,12 @@
 """Chapters on quality: the table of scores, curves, error against run time, training."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from fourd.evaluate.table import MASK_METRICS
+from fourd.evaluate.table import DEPTH_METRICS, DEPTHS, MASK_METRICS
 from fourd.report.charts import Series, line_chart, scatter_chart
 from fourd.report.html import Markup, figure, join, more, section, table, tag
 from fourd.report.numbers import plural, show, show_seconds
@@ -60,6 +61,7 @@ def score_chapter(document: Document, scores: Scores | None) -> Markup:
             for pair in regions[:2]
         ],
         _mask_line(document["scores"]["masks"]),
+        _depth_table(document["scores"]["depths"]),
         _set_table(rows),
         _region_table(rows, metric),
         tag("ul", [tag("li", note) for note in document["scores"]["notes"]], class_="notes"),
@@ -79,6 +81,27 @@ def _mask_line(masks: Mapping[str, float | None]) -> Markup | None:
     words = [f"{text} {show(masks[key])}" for key, text in MASK_METRICS.items() if masks.get(key) is not None]
     text = "The workflow's own masks of what moves, against the true ones: "
     return tag("p", text + ", ".join(words) + ".") if words else None
+
+
+def _depth_table(rows: Sequence[Document]) -> Markup | None:
+    """The workflow's own depth against the true one."""
+    cell = {(row["method"], row["region"], row["metric"]): row["mean"] for row in rows}
+    regions = dict.fromkeys(row["region"] for row in rows)
+    body = [
+        (
+            DEPTHS[method],
+            region_title(region),
+            *(
+                "-" if (mean := cell.get((method, region, metric))) is None else form.format(mean)
+                for metric, (_, form) in DEPTH_METRICS.items()
+            ),
+        )
+        for method, region in itertools.product(DEPTHS, regions)
+        if any(cell.get((method, region, metric)) is not None for metric in DEPTH_METRICS)
+    ]
+    title = "The workflow's depth against the true one, as shares of the true depth"
+    header = ("depth", "region", *(name for name, _ in DEPTH_METRICS.values()))
+    return table(header, body, title, range(2, 6)) if body else None
 
 
 def _set_table(rows: Sequence[Document]) -> Markup | None:
@@ -195,7 +218,7 @@ def _other_curves(scores: Scores, regions: Sequence[tuple[str, str]], headline: 
         )
         for region, source in regions
         for metric in scores.names["metric"]
-        if (region, metric) not in shown and not metric.startswith((*SET_METRICS, "mask_"))
+        if (region, metric) not in shown and not metric.startswith((*SET_METRICS, "mask_", "depth_"))
     ]
     views = scores.names["view"]
     if headline and len(views) > 1 and regions:

@@ -16,6 +16,7 @@ from fourd.ingest import open_camera
 from fourd.io import Archive, read_image
 from fourd.render import BackgroundReader, list_frames
 from fourd.report import ReportOptions
+from fourd.report.current import Current
 from fourd.report.scores import Scores, ranked_frames
 from fourd.sfm import SceneCameras, read_cameras
 from fourd.stereo.files import decode_disparity
@@ -85,29 +86,26 @@ def choose_frames(view: View, scores: Scores | None, max_frames: int) -> list[tu
 
 
 def collect_pictures(
-    results: Path, views: Sequence[str], scores: Scores | None, options: ReportOptions
+    results: Path, current: Current, scores: Scores | None, options: ReportOptions
 ) -> list[FrameShow]:
-    """Pictures of the chosen frames; a file that is gone leaves a place with its reason.
-
-    views: names of the views that the scene has now
-    """
+    """Pictures of the chosen frames; a file that is gone leaves a place with its reason."""
     scene = read_cameras(results / "sfm" / "cameras.json")
-    rendered = [name for name in views if (results / "render" / name).is_dir()]
+    rendered = [name for name in current.views if (results / "render" / name).is_dir()]
     shows = []
     for name in choose_views(scene, rendered, options.max_views):
         view = read_view(results / "views" / f"{name}.json")
         if not view.frames:
             continue
-        folders = sorted(path for path in (results / "render" / name).iterdir() if path.is_dir())
-        images = list_frames(folders)
+        images = list_frames(current.chunks_in(results / "render" / name, name))
         for frame, why in choose_frames(view, scores, options.max_frames):
             rendering = read_image(images[frame]) if frame in images else None
-            shows.append(_show_frame(results, scene, view, view.at(frame), why, rendering, options))
+            shows.append(_show_frame(results, current, scene, view, view.at(frame), why, rendering, options))
     return shows
 
 
 def _show_frame(
     results: Path,
+    current: Current,
     scene: SceneCameras,
     view: View,
     entry: ViewFrame,
@@ -122,9 +120,9 @@ def _show_frame(
         )
         if truth is None:
             pictures.append(Picture("truth", reason, None))
-    pictures += _of_stereo(results, scene, view, entry)
-    pictures += _of_foreground(results, view.name, entry.frame)
-    pictures += _of_background(results, view.name, entry.frame)
+    pictures += _of_stereo(results, current, scene, view, entry)
+    pictures += _of_foreground(results, current, view.name, entry.frame)
+    pictures += _of_background(results, current, view.name, entry.frame)
     if rendered is None:
         pictures.append(Picture("render", "this frame has not been rendered", None))
     else:
@@ -151,9 +149,9 @@ def _filmed(
     return image, ""
 
 
-def _archive_with(folder: Path, frame: int) -> Archive | None:
-    """The chunk of a folder that has a frame; the caller closes it."""
-    for path in sorted(folder.glob("[0-9]*.npz")):
+def _archive_with(paths: Sequence[Path], frame: int) -> Archive | None:
+    """The chunk that has a frame; the caller closes it."""
+    for path in paths:
         first, last = map(int, path.stem.split("-"))
         if first <= frame <= last:
             return Archive(path)
@@ -173,12 +171,16 @@ def nearest_pair(pairs: Iterable[str], centers: Mapping[str, np.ndarray], center
     return min(sorted(distance), key=lambda pair: distance[pair], default=None)
 
 
-def _of_stereo(results: Path, scene: SceneCameras, view: View, entry: ViewFrame) -> list[Picture]:
+def _of_stereo(
+    results: Path, current: Current, scene: SceneCameras, view: View, entry: ViewFrame
+) -> list[Picture]:
     frame = entry.scene_frame
     found = {}
     for folder in sorted((results / "disparity").glob("*")):
-        paths = [p for p in folder.glob("[0-9]*.npz") if int(p.stem[:6]) <= frame <= int(p.stem[-6:])]
-        if paths and view.name not in folder.name.split("-"):
+        if not current.has_pair(folder.name) or view.name in folder.name.split("-"):
+            continue
+        paths = [p for p in current.chunks_in(folder) if int(p.stem[:6]) <= frame <= int(p.stem[-6:])]
+        if paths:
             with closing(Archive(paths[0])) as archive:
                 if archive.meta["status"] == "ok":
                     found[folder.name] = paths[0]
@@ -214,8 +216,8 @@ def _masked(image: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(valid[..., None], image, np.uint8(BLANK))
 
 
-def _of_foreground(results: Path, view: str, frame: int) -> list[Picture]:
-    archive = _archive_with(results / "foreground" / view, frame)
+def _of_foreground(results: Path, current: Current, view: str, frame: int) -> list[Picture]:
+    archive = _archive_with(current.chunks_in(results / "foreground" / view, view), frame)
     if archive is None:
         return _gone(ESTIMATES, "the foreground of this moment")
     captions = {
@@ -237,8 +239,8 @@ def _of_foreground(results: Path, view: str, frame: int) -> list[Picture]:
     return pictures
 
 
-def _of_background(results: Path, view: str, frame: int) -> list[Picture]:
-    archive = _archive_with(results / "background" / view, frame)
+def _of_background(results: Path, current: Current, view: str, frame: int) -> list[Picture]:
+    archive = _archive_with(current.chunks_in(results / "background" / view, view), frame)
     if archive is None:
         return _gone(("background",), "the background of this view")
     with closing(archive):

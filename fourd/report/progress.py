@@ -6,6 +6,7 @@ from typing import Any
 
 from fourd.io import read_csv
 from fourd.report.costs import Clock, Job
+from fourd.report.current import Current
 from fourd.report.numbers import finite, parse
 from fourd.report.scores import headline_metric, is_higher_better
 
@@ -27,10 +28,11 @@ READY_AFTER = {
 OF_ALL_CAMERAS = ("prepare_camera",)
 
 
-def collect_training(results: Path) -> list[dict[str, Any]]:
+def collect_training(results: Path, current: Current) -> list[dict[str, Any]]:
     """Per level of the composition the columns of train.csv, numbers or None."""
     levels = []
-    for path in sorted(results.glob("composition/*/train.csv")):
+    paths = [path for path in sorted(results.glob("composition/[0-9]/train.csv"))]
+    for path in (path for path in paths if current.has_level(path.parent.name)):
         rows = read_csv(path)
         columns = {key: [finite(parse(row[key])) for row in rows] for key in (rows[0] if rows else {})}
         levels.append({"level": path.parent.name, "columns": columns})

@@ -1,7 +1,7 @@
 """What was filmed, from where and when: cameras, clocks, pairs, and what was left out with its reason."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fourd.io import Archive, read_csv, read_json
+from fourd.report.current import Current
 from fourd.report.numbers import finite, parse
 
 MAX_MAP_POINTS = 1200
@@ -49,22 +50,6 @@ def collect_scene(results: Path) -> dict[str, Any]:
         },
         "calibration_notes": films.get("notes", []),
     }
-
-
-def current_views(results: Path, trajectories: Collection[str] | None) -> list[str]:
-    """Names of the views that the scene has now: its cameras, and films of the configuration.
-
-    trajectories: names in the configuration, None where it is not known. Results of a camera that was
-    taken out of the scene, or of a film that is no longer asked for, may still lie there.
-    """
-    document = read_json(results / "sfm" / "cameras.json")
-    cameras = {*document["inputs"], *document["heldout"], *document["left_out"]}
-    return [
-        path.stem
-        for path in sorted((results / "views").glob("*.json"))
-        if path.stem in cameras
-        or (read_json(path)["role"] == "virtual" and (trajectories is None or path.stem in trajectories))
-    ]
 
 
 def _read_if_there(path: Path) -> dict[str, Any]:
@@ -112,10 +97,10 @@ def _describe_camera(
     }
 
 
-def collect_map(results: Path, views: Sequence[str]) -> dict[str, Any]:
+def collect_map(results: Path, views: Iterable[str]) -> dict[str, Any]:
     """The part `map`: everything seen from above, (x, y) in world units.
 
-    views: of `current_views`. y points where the input cameras look on average, so that the event
+    views: names of the scene's views. y points where the input cameras look on average, so that the event
     lies in the upper half.
     """
     document = read_json(results / "sfm" / "cameras.json")
@@ -188,14 +173,11 @@ def _points_near(path: Path, centers: np.ndarray) -> np.ndarray:
     return points[:: max(1, -(-len(points) // MAX_MAP_POINTS))]
 
 
-def collect_pairs(results: Path) -> list[dict[str, Any]]:
+def collect_pairs(results: Path, current: Current) -> list[dict[str, Any]]:
     """The part `pairs`: how each pair of input cameras is matched, or why it is not."""
     pairs = []
-    document = read_json(results / "sfm" / "cameras.json")
-    # A camera that was taken out, or is held out now, is in no pair.
-    cameras = {*document["inputs"], *document["left_out"]}
     for path in sorted((results / "rectification").glob("*.npz")):
-        if not cameras.issuperset(path.stem.split("-")):
+        if not current.has_pair(path.stem):
             continue
         with closing(Archive(path)) as archive:
             meta = archive.meta
@@ -217,13 +199,12 @@ def collect_pairs(results: Path) -> list[dict[str, Any]]:
     return pairs
 
 
-def collect_renders(results: Path, views: Sequence[str]) -> list[dict[str, Any]]:
+def collect_renders(results: Path, current: Current) -> list[dict[str, Any]]:
     """The part `renders`: per view and level the share of blank pixels and why coarser levels help or not."""
     renders = []
-    for view in views:
-        rows = [
-            row for path in sorted((results / "render" / view).glob("*/holes.csv")) for row in read_csv(path)
-        ]
+    for view in current.views:
+        tables = [path / "holes.csv" for path in current.chunks_in(results / "render" / view, view)]
+        rows = [row for path in tables if path.is_file() for row in read_csv(path)]
         for level in sorted({row["level"] for row in rows}):
             own = [row for row in rows if row["level"] == level]
             holes, filled = (
@@ -245,7 +226,7 @@ def collect_renders(results: Path, views: Sequence[str]) -> list[dict[str, Any]]
 
 def collect_left_out(
     results: Path,
-    views: Sequence[str],
+    current: Current,
     pairs: Sequence[Mapping[str, Any]],
     rows: Sequence[Mapping[str, Any]],
 ) -> list[dict[str, str]]:
@@ -253,7 +234,7 @@ def collect_left_out(
 
     pairs, rows: of the parts `pairs` and `scores`
     """
-    found = [*_left_out(results, views, pairs), *_empty_methods(rows)]
+    found = [*_left_out(results, current, pairs), *_empty_methods(rows)]
     return [{"kind": kind, "name": name, "reason": reason} for kind, name, reason in found]
 
 
@@ -265,19 +246,20 @@ def _empty_methods(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str
 
 
 def _left_out(
-    results: Path, views: Sequence[str], pairs: Sequence[Mapping[str, Any]]
+    results: Path, current: Current, pairs: Sequence[Mapping[str, Any]]
 ) -> Iterator[tuple[str, str, str]]:
     cameras = read_json(results / "sfm" / "cameras.json")
     for name, reason in cameras["left_out"].items():
         yield "camera", name, reason
-    for name in views:
+    for name in current.views:
         status = read_json(results / "views" / f"{name}.json")["status"]
         if status != "ok" and name not in cameras["left_out"]:
             yield "view", name, status
     for pair in pairs:
         if pair["status"] != "ok":
             yield "pair", pair["pair"], pair["status"]
-    paths = [path for name in views for path in sorted((results / "foreground" / name).glob("*.npz"))]
+    folder = results / "foreground"
+    paths = [path for name in current.views for path in current.chunks_in(folder / name, name)]
     for path in paths:
         with closing(Archive(path)) as archive:
             for frame, status in archive.meta.get("frame_status", {}).items():

@@ -2,7 +2,7 @@
 
 import csv
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +36,12 @@ class Scores:
         return self.names[column].index(name)
 
 
-def read_scores(path: Path) -> Scores:
-    """Read metrics.csv row by row: a long event has millions. Raises InputError for missing columns."""
+def read_scores(path: Path, views: Collection[str] | None = None) -> Scores:
+    """Read metrics.csv row by row: a long event has millions.
+
+    views: rows of others are of an earlier scene and left out;  None: all are read
+    Raises InputError for missing columns.
+    """
     seen: dict[str, dict[str, int]] = {key: {} for key in _KEYS}
     codes: dict[str, list[int]] = {key: [] for key in _KEYS}
     values: list[float] = []
@@ -51,8 +55,10 @@ def read_scores(path: Path) -> Scores:
                 "delete it and evaluate again"
             )
         columns = [(header.index(key), seen[key], codes[key].append) for key in _KEYS]
-        at_value = header.index("value")
+        at_view, at_value = header.index("view"), header.index("value")
         for row in reader:
+            if views is not None and row[at_view] not in views:
+                continue
             for at, known, append in columns:
                 append(known.setdefault(row[at], len(known)))
             values.append(float(row[at_value] or "nan"))

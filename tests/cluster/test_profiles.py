@@ -54,10 +54,29 @@ def test_dry_run_shows_groups_and_resources(workspace: Workspace, name: str) -> 
     assert "mem_mb=6000" in training and "gpu=0" in training
 
 
+def test_what_is_asked_for_beside_films_travels_in_groups(workspace: Workspace) -> None:
+    """Jobs that a user may have dozens of; a submission must not wait for itself."""
+    pytest.importorskip("snakemake_executor_plugin_slurm")
+    workspace.write_scene("demo", tiny_scene())
+    mark = {"frame": 0, "view": "cam01", "box": [10, 10, 40, 40]}
+    edits = workspace.folder / "config" / "edits"
+    edits.mkdir()
+    edit = {"scene": "demo", "operation": "remove", "marks": [mark], "views": ["hold_view", "cam01"]}
+    (edits / "gone.yaml").write_text(yaml.safe_dump(edit))
+    targets = ("viewer", "export", "edit_all")
+    printed = engine(workspace, "none", *targets, "-n", "--config", "format=colmap,png16")  # type: ignore[arg-type]
+    grouped = set(re.findall(r"^ +(?:local)?rule (\w+):", printed, re.MULTILINE))
+    alone = set(re.findall(r"^(?:local)?rule (\w+):", printed, re.MULTILINE)) - grouped
+    single = {"viewer", "export", "edit_all", "viewer_page", "edit_masks", "train_level", "demo_cameras"}
+    assert alone <= single | {"import_cameras", "judge_need", "match_colours", "film_cameras"}
+    for rule in ("fuse_lattice", "map_lattice", "render_lattice", "edit_view", "edit_film", "export_event"):
+        assert rule in grouped, rule
+
+
 def test_every_rule_of_the_profile_exists() -> None:
     profile = yaml.safe_load((PROFILES / "slurm" / "profile.yaml").read_text())
     text = "".join(path.read_text() for path in sorted((REPOSITORY / "rules").glob("*.smk")))
-    rules = set(re.findall(r"^\s*rule (\w+):", text, re.MULTILINE))
+    rules = set(re.findall(r"^\s*(?:rule|use rule \w+ as) (\w+)(?: with)?:", text, re.MULTILINE))
     groups = dict(entry.split("=") for entry in profile["groups"])
     assert groups.keys() | profile["set-resources"].keys() <= rules
     assert {entry.split("=")[0] for entry in profile["group-components"]} == set(groups.values())

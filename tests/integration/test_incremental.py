@@ -177,6 +177,8 @@ def test_frames_at_the_end_are_not_probed_again(never_planned: Workspace) -> Non
     never_planned.write_scene("event", event_scene())
     assert "probe_camera" not in counts
     assert counts["sample_camera"] == 5
+    # Colours, moments of the background and frames to train on are spread over the whole clip.
+    assert counts["match_colours"] == counts["train_level"] == 1
 
 
 def frame_arrays(workspace: Workspace) -> dict[tuple[str, ...], bytes]:

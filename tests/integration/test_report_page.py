@@ -1,28 +1,11 @@
 """The page of a scene in a real browser: nothing is asked of a network, all is shown, nothing is cut off."""
 
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from fourd.report.__main__ import main
 from tests.unit import report_scene
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator:
-    program = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if program is None:
-        pytest.skip(f"needs a browser: none of {', '.join(BROWSERS)} is installed")
-    driver = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
-    with driver.sync_playwright() as playwright:
-        # Without the sandbox a browser starts as root too, as in containers; it opens one own file.
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +15,7 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     metrics = ("mse", "psnr_db", "a_metric_with_a_rather_long_name")
     methods = tuple(f"method_{i}" for i in range(9)) + ("ours",)
     report_scene.write_scores(folder / "results" / "evaluate" / "metrics.csv", 3, 40, methods, metrics)
+    report_scene.hold_out(folder / "results", 3)
     report_scene.write_benchmarks(folder / "benchmarks")
     main(
         ["--results", str(folder / "results"), "--benchmarks", str(folder / "benchmarks")]

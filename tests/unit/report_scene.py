@@ -129,6 +129,15 @@ def write_scores(
     io.write_csv(path, columns, rows)
 
 
+def hold_out(folder: Path, num_views: int) -> None:
+    """The scene with as many held-out cameras, cam01 and on; only the first one has results."""
+    document = io.read_json(folder / "sfm" / "cameras.json")
+    document["heldout"] = [f"cam{view + 1:02d}" for view in range(num_views)]
+    document["left_out"] = {}
+    document["inputs"] = [name for name in document["inputs"] if name not in document["heldout"]]
+    io.write_json(folder / "sfm" / "cameras.json", document)
+
+
 def write_benchmarks(folder: Path) -> None:
     """Times of three rules, the last of which the report does not know."""
     header = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load\tcpu_time\n"

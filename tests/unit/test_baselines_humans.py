@@ -15,7 +15,9 @@ from fourd.baselines.humans.people import Person, find_people
 from fourd.baselines.humans.pose import NUM_LANDMARKS, Pose, _tiles
 from fourd.camera import Camera
 from fourd.errors import InputError
+from fourd.evaluate.people import read_people
 from fourd.geometry import look_at
+from fourd.io import ArchiveWriter
 from tests.conftest import REPOSITORY
 from tests.unit.baseline_evidence import make_evidence
 
@@ -236,6 +238,36 @@ def test_without_models_the_row_says_why(tmp_path):
     (tmp_path / "pose" / "pose_detection.tflite").write_bytes(b"other")
     with pytest.raises(InputError, match="pose_detection.tflite with SHA-256"):
         load_models(str(tmp_path))
+
+
+def test_fits_of_the_people_are_drawn_over_the_points(body):
+    """A body 3 units ahead, fitted elsewhere: no network is needed to draw it."""
+    fit = np.zeros((1, NUM_PARAMETERS))
+    fit[0, 6] = np.log(2 / np.ptp(body.vertices[:, 1]))
+    fit[0, 2] = 3.0
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, (200, 2)), np.full(200, 3.0)])
+    evidence = make_evidence(points=points, people=np.zeros((0, NUM_PARAMETERS)), humans=str(MODELS))
+    without = METHODS["sfm_humans"](evidence)
+    np.testing.assert_array_equal(without, METHODS["sfm_dense"](evidence))
+    drawn = METHODS["sfm_humans"](dataclasses.replace(evidence, people=fit))
+    changed = (drawn != without).any(axis=2)
+    rows, columns = np.nonzero(changed)
+    assert 0.02 < changed.mean() < 0.6
+    middle = evidence.camera.project(np.array([0.0, 0, 3]))[0]
+    assert abs(columns.mean() - middle[0]) < 8
+
+
+def test_people_are_read_with_the_reason_where_there_are_none(tmp_path):
+    assert read_people(None, "")[1].startswith("no models are given")
+    assert "python -m fourd.evaluate people" in read_people(None, str(tmp_path))[1]
+    with ArchiveWriter(tmp_path / "none.npz", {"status": "no folder x"}):
+        pass
+    assert read_people(tmp_path / "none.npz", "x") == ({}, "no folder x")
+    with ArchiveWriter(tmp_path / "people.npz", {"status": "ok"}) as writer:
+        writer.add_frame(7, fits=np.ones((2, NUM_PARAMETERS)))
+    fits, reason = read_people(tmp_path / "people.npz", "x")
+    assert list(fits) == [7] and fits[7].shape == (2, NUM_PARAMETERS) and reason == ""
 
 
 def test_squares_cover_the_picture_and_overlap_by_half():

@@ -55,6 +55,18 @@ def test_edit_is_read(tmp_path: Path) -> None:
         ({"operation": "insert"}, "expected `insert:` with the operation insert"),
         ({"operation": "insert", "insert": {"shift_frames": 0}}, "shift_frames other than 0"),
         ({"marks": [{"view": "cam01", "frame": 0, "mask": "nowhere.png"}]}, "expected a file at nowhere.png"),
+        (
+            {"marks": [{"view": "cam01", "frame": 0, "mask": "{scene.__class__}.png"}]},
+            "marks.0.mask is '{scene.__class__}.png'",
+        ),
+        (
+            {"operation": "insert", "insert": {"pictures": "cat{view}.png"}},
+            "insert.pictures is 'cat{view}.png'",
+        ),
+        (
+            {"operation": "insert", "insert": {"pictures": "<results>/cat.png"}},
+            "insert.pictures is '<results>",
+        ),
     ],
 )
 def test_faults_of_an_edit_are_sentences(tmp_path: Path, changes: dict, message: str) -> None:
@@ -205,3 +217,19 @@ def test_command_refuses_and_leaves_nothing_behind(tmp_path: Path) -> None:
         main(["mark", "cam04", "12", "--polygon", "9", "2", "1", "--views", "cam04", "--output", str(path)])
     with pytest.raises(InputError, match="one of --box"):
         main(["mark", "cam04", "12", "--views", "cam04", "--output", str(path)])
+
+
+def test_command_leaves_other_edits_alone(tmp_path: Path) -> None:
+    path = tmp_path / "gone.yaml"
+    command = ["mark", "cam04", "12", "--views", "cam04", "--output", str(path), "--box"]
+    main([*command, "1", "2", "9", "8"])
+    text = "# Mine.\n" + path.read_text()
+    path.write_text(text)
+    main([*command, "1", "2", "9", "8"])
+    for corners, message in (
+        (("1", "2", "9", "9"), "says something else"),
+        (("9", "2", "1", "8"), "left < right"),
+    ):
+        with pytest.raises(InputError, match=message):
+            main([*command, *corners])
+    assert path.read_text() == text

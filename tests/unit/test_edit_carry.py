@@ -220,6 +220,6 @@ def test_flow_carries_a_mask_and_knows_where_it_does_not() -> None:
 
 def test_one_film_alone_is_followed() -> None:
     frames = shifted(12)
-    masks = list(follow_mask((image for image, _ in frames), frames[0][1]))
+    masks = follow_mask([image for image, _ in frames], frames[0][1])
     assert (masks[0] == frames[0][1]).all() and len(masks) == 12
     assert min(iou(mask, truth) for mask, (_, truth) in zip(masks, frames, strict=True)) > 0.85

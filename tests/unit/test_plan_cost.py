@@ -7,6 +7,7 @@ import pytest
 
 from fourd.errors import InputError
 from fourd.plan.budget import (
+    LEVEL_DB,
     PAIRS_DB,
     SAMPLES_DB,
     STEPS_GAIN_DB,
@@ -21,22 +22,48 @@ from fourd.plan.budget import (
 from fourd.plan.cost import KINDS, RATES, Machine, corrections, cpu_seconds, forecast, read_finished
 from fourd.plan.files import read_machine_file
 from fourd.plan.options import PlanOptions
-from fourd.plan.outline import Job, list_jobs
+from fourd.plan.outline import Job, count_by_rule, list_jobs, list_rendering, list_training, list_viewer
 from fourd.plan.show import check_document, describe, make_document, show_size, show_time
 from fourd.plan.work import choose_work
 from tests.unit.plan_scene import PAIRS, make_outline, make_scene, make_survey
 
 MACHINE = Machine(num_cores=2)
+CONFIG = {
+    "plan": {"max_pairs": None, "foreground": "auto"},
+    "background": {"num_samples": 7, "fill_px": 10},
+    "composition": {"epochs": 10, "depth": 4},
+    "max_levels": 3,
+    "seed": 1,
+}
 
 
-def all_jobs() -> list[Job]:
+def all_jobs(**settings: object) -> list[Job]:
     survey = make_survey()
-    return list_jobs(make_outline(), survey, choose_work(survey, PAIRS, PlanOptions()))
+    return list_jobs(make_outline(**settings), survey, choose_work(survey, PAIRS, PlanOptions()))
+
+
+def viewer_jobs(num_moments: int = 90) -> list[Job]:
+    lattice = {"views": ["lattice-00", "lattice-01"], "num_moments": num_moments, "size": [240, 135]}
+    work = choose_work(make_survey(), PAIRS, PlanOptions())
+    return list_viewer(make_outline(), lattice | {"size_mb": 19.0}, work)
+
+
+def test_the_viewer_makes_every_view_in_chunks_and_one_page() -> None:
+    counts = count_by_rule(viewer_jobs())
+    assert counts.pop("viewer_page") == 1 and counts.pop("place_lattice") == 2
+    assert set(counts.values()) == {2 * 2}
+    # Pictures of half the width and height are a quarter of the work.
+    half, full = (
+        sum(job.amount for job in jobs if job.rule.startswith("render"))
+        for jobs in (viewer_jobs(120), list_rendering(make_outline()))
+    )
+    views = sum(view["num_frames"] for view in make_outline()["views"].values() if view["role"] != "input")
+    assert half / (2 * 120) == pytest.approx(full / views / 4)
 
 
 def test_every_job_has_a_price() -> None:
-    jobs = all_jobs()
-    assert {job.rule for job in jobs} == set(RATES)
+    jobs = all_jobs(evaluate={"humans": "models"})
+    assert {job.rule for job in [*jobs, *viewer_jobs()]} == set(RATES)
     costs = forecast(jobs, (480, 270), MACHINE, {})
     assert costs["jobs"] == costs["jobs_left"] == len(jobs)
     assert costs["cpu_minutes"] * 60 == pytest.approx(sum(cpu_seconds(job, MACHINE) for job in jobs))
@@ -152,24 +179,48 @@ def test_the_same_budget_gives_the_same_work_whatever_is_finished(tmp_path: Path
     assert reduce_config(config, {}, tmp_path / "none", tmp_path / "none", ()) == (config, None)
 
 
-def test_a_reduction_changes_its_own_keys_only() -> None:
-    config = {
-        "plan": {"max_pairs": None, "foreground": "auto"},
-        "background": {"num_samples": 7, "fill_px": 10},
-        "composition": {"epochs": 10, "depth": 4},
-        "seed": 1,
+def test_levels_are_dropped_before_pairs_that_matter() -> None:
+    outline = make_outline(make_scene(size=(1920, 1080)), composition={"num_filters": [8, 8, 8]})
+    assert outline["num_levels"] == 3
+
+    def fit_levels(minutes: float, *fixed: str) -> Reduction:
+        return fit_budget(outline, make_survey(), PlanOptions(), MACHINE, minutes, None, fixed)
+
+    whole, least = fit_levels(1e6), fit_levels(1e-3)
+    assert (whole.num_levels, whole.loss_db) == (3, 0.0)
+    assert least.num_levels == 1 and not least.fits
+    reduced = fit_levels(0.98 * whole.minutes)
+    assert (reduced.num_levels, reduced.max_pairs, reduced.epochs) == (2, None, whole.epochs)
+    assert reduced.loss_db == pytest.approx(LEVEL_DB)
+    assert fit_levels(1e-3, "max_levels").num_levels == 3
+    assert apply_reduction(CONFIG, reduced)["max_levels"] == 2
+
+
+def test_a_training_sample_is_cropped_after_it_was_made_smaller() -> None:
+    settings = {"num_filters": [8], "crop": None, "epochs": 1, "min_scale": 0.5, "max_scale": 0.5}
+    scene = make_scene(size=(480, 270))
+    amounts = {
+        crop: list_training(make_outline(scene, composition=settings | {"crop": crop}))[0].amount
+        for crop in (None, 192, 100)
     }
-    reduced = apply_reduction(config, fit(0.001))
+    assert amounts[192] / amounts[None] == pytest.approx(192 / 240)
+    assert amounts[100] / amounts[None] == pytest.approx(100**2 / (240 * 135))
+
+
+def test_a_reduction_changes_its_own_keys_only() -> None:
+    reduced = apply_reduction(CONFIG, fit(0.001))
     assert reduced["seed"] == 1 and reduced["background"]["fill_px"] == 10
     assert reduced["background"]["num_samples"] == 1
-    assert config["background"]["num_samples"] == 7
+    assert CONFIG["background"]["num_samples"] == 7
 
 
 def make_plan(budget: dict | None = None, finished: dict | None = None, earlier: dict | None = None) -> dict:
     survey = make_survey(silhouettes="stereo suffices: 4 of 6 pairs are matched")
     outline, work = make_outline(), choose_work(survey, PAIRS, PlanOptions())
     costs = forecast(list_jobs(outline, survey, work), outline["size"], MACHINE, finished or {})
-    return make_document(outline, survey, work, {"cam09": "too dark"}, budget, costs, 12, earlier)
+    own = forecast(viewer_jobs(), (240, 135), MACHINE, {})
+    viewer = {"size_mb": 19.0, "forecast": own}
+    return make_document(outline, survey, work, {"cam09": "too dark"}, budget, costs, viewer, 12, earlier)
 
 
 def test_the_plan_follows_its_schema_and_says_why() -> None:
@@ -183,6 +234,7 @@ def test_the_plan_follows_its_schema_and_says_why() -> None:
         "stereo suffices",
         "the films have 270 lines",
         "budget of 2 min",
+        "a page of 19 MB by 19 of 19 more jobs",
     ):
         assert words in text, words
     assert all(row["reason"] for row in document["decisions"] if not row["is_made"])

@@ -17,6 +17,7 @@ from fourd.cli import run_stage
 from fourd.errors import InputError
 from fourd.report import ReportOptions, pictures
 from fourd.report.__main__ import main, parse_settings
+from fourd.report.current import read_current
 from fourd.report.document import SCHEMA, check_document
 from fourd.report.html import VOID_TAGS
 from fourd.report.map import draw_map
@@ -154,7 +155,8 @@ def test_truth_that_is_gone_is_said(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "results", path)
     for film in (path / "frames" / "cameras").glob("*.npz"):
         film.unlink()
-    shows = pictures.collect_pictures(path, [report_scene.HELDOUT], None, ReportOptions(max_frames=1))
+    current = read_current(path, None, None, None)
+    shows = pictures.collect_pictures(path, current, None, ReportOptions(max_frames=1))
     assert shows[0].truth is None and shows[0].rendered is not None
     assert any(p.title == "truth" and p.image is None and "cam01" in p.caption for p in shows[0].pictures)
 
@@ -208,6 +210,7 @@ def test_long_events_are_reported_in_seconds(folder: Path, tmp_path: Path) -> No
     report_scene.write_scores(
         table, num_views=15, num_frames=300, methods=("ours", "inst", "x"), metrics=("mse",)
     )
+    report_scene.hold_out(tmp_path / "results", 15)
     start = time.process_time()
     make(tmp_path, "page", "--max-views", "0")
     assert time.process_time() - start < 10

@@ -1,6 +1,5 @@
-"""Recovered cameras and clocks against true ones; results that a scene no longer has."""
+"""Recovered cameras and clocks against true ones."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,9 @@ from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.geometry import look_at
 from fourd.report.__main__ import main
-from fourd.report.scene import collect_left_out, collect_pairs, collect_renders, current_views
 from fourd.report.truth import collect_truth
 from fourd.sfm.compare import WorldSimilarity
-from tests.unit.report_scene import HELDOUT, NAMES, write_benchmarks, write_results, write_scores
+from tests.unit.report_scene import NAMES, write_benchmarks, write_results, write_scores
 
 SIZE = (96, 64)
 TURN_DEG = 0.2
@@ -97,43 +95,15 @@ def results(tmp_path: Path) -> Path:
     return folder
 
 
-def leave_stale_results(results: Path) -> None:
-    """Of a camera and a film that the scene does not have any more."""
-    for kind in ("foreground", "render"):
-        shutil.copytree(results / kind / HELDOUT, results / kind / "gone")
-    view = io.read_json(results / "views" / f"{HELDOUT}.json")
-    io.write_json(results / "views" / "gone.json", {**view, "name": "gone"})
-    io.write_json(results / "views" / "old_film.json", {**view, "name": "old_film", "role": "virtual"})
-    shutil.copytree(results / "render" / HELDOUT, results / "render" / "old_film")
-    (results / "render" / "old_film.mp4").write_bytes(b"film")
-    shutil.copy(results / "rectification" / "cam00-cam02.npz", results / "rectification" / "cam00-gone.npz")
-    shutil.copy(
-        results / "rectification" / "cam00-cam02.npz", results / "rectification" / f"cam00-{HELDOUT}.npz"
-    )
-
-
-def test_results_of_a_removed_camera_or_film_are_not_shown(results: Path) -> None:
-    before = collect_pairs(results)
-    leave_stale_results(results)
-    assert current_views(results, []) == [HELDOUT]
-    assert current_views(results, None) == [HELDOUT, "old_film"]
-    assert collect_pairs(results) == before
-    views = current_views(results, [])
-    assert {row["view"] for row in collect_renders(results, views)} == {HELDOUT}
-    left_out = collect_left_out(results, views, before, [])
-    assert not any("gone" in entry["name"] or "old_film" in entry["name"] for entry in left_out)
-
-
-def test_the_page_shows_truth_and_validation_and_nothing_stale(results: Path, tmp_path: Path) -> None:
-    leave_stale_results(results)
+def test_the_page_shows_truth_and_validation(results: Path, tmp_path: Path) -> None:
     write_recovered(results)
     io.write_png(results / "composition" / "0" / "validation.png", np.full((20, 60, 3), 90, np.uint8))
     command = ["--results", str(results), "--benchmarks", str(tmp_path / "benchmarks" / "event")]
-    command += ["--settings", '{"trajectories": {}}', "--truth", str(write_truth(tmp_path / "phones.json"))]
-    main([*command, "--output", str(tmp_path / "page")])
+    main(
+        [*command, "--truth", str(write_truth(tmp_path / "phones.json")), "--output", str(tmp_path / "page")]
+    )
     page = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
     assert "Against the truth" in page and "Level 0, samples kept apart" in page
-    assert "old_film" not in page and "old film" not in page and "cam00-gone" not in page
     document = io.read_json(tmp_path / "page" / "report.json")
     assert [row["name"] for row in document["truth"]["cameras"]] == list(NAMES)
 

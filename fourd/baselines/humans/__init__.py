@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fourd.baselines.humans.body import BodyModel, read_body
+from fourd.baselines.humans.body import NUM_PARAMETERS, BodyModel, read_body
 from fourd.baselines.humans.fit import fit_parameters, is_plausible
 from fourd.baselines.humans.people import find_people
 from fourd.baselines.humans.pose import PoseNetwork
@@ -35,8 +35,8 @@ class HumanModels:
     network: PoseNetwork
     body: BodyModel
 
-    def fit_people(self, pictures: Mapping[str, tuple[np.ndarray, Camera]]) -> list[np.ndarray]:
-        """(V, 3) float64 vertices of each person in world units, those seen in most views first.
+    def fit_people(self, pictures: Mapping[str, tuple[np.ndarray, Camera]]) -> np.ndarray:
+        """(N, NUM_PARAMETERS) float64 of the body, world units; people seen in most views first.
 
         pictures: (H, W, 3) uint8 and its pinhole by camera, all of one moment
         Finds that fit no body are left out: two views may agree on what is nobody.
@@ -45,11 +45,12 @@ class HumanModels:
         people = find_people(found, {name: camera for name, (_, camera) in pictures.items()})
         fits = [fit_parameters(self.body, person) for person in people]
         # The one that most views share is believed; others are of about the same size.
-        return [
-            self.body.place_vertices(fit)
+        kept = [
+            fit
             for person, fit in zip(people, fits, strict=True)
             if is_plausible(self.body, person, fit, fits[0])
         ]
+        return np.array(kept).reshape(-1, NUM_PARAMETERS)
 
 
 def missing_models(folder: str) -> str | None:
@@ -67,4 +68,10 @@ def missing_models(folder: str) -> str | None:
 @functools.lru_cache(maxsize=1)
 def load_models(folder: str) -> HumanModels:
     """The models of a folder for which `missing_models` has no reason. Raises InputError for other files."""
-    return HumanModels(PoseNetwork(Path(folder) / POSE_FOLDER), read_body(Path(folder) / BODY_FOLDER))
+    return HumanModels(PoseNetwork(Path(folder) / POSE_FOLDER), load_body(folder))
+
+
+@functools.lru_cache(maxsize=1)
+def load_body(folder: str) -> BodyModel:
+    """The body alone, which places fits without the networks. Raises InputError for other files."""
+    return read_body(Path(folder) / BODY_FOLDER)
