@@ -86,17 +86,7 @@ def fuse_view(
     """
     _check(target, images, cameras, estimates)
     wanted = [e for e in ESTIMATES if e in estimates]
-    has_visibility = options.visibility and "consensus" in wanted
-    rules = FusionRules(
-        options.tolerance,
-        max(1, min(options.min_pairs, len(pairs))),
-        options.min_cameras,
-        options.max_front,
-        farthest_min_pairs,
-        # What the visibility test chooses among, whether it is coloured or not.
-        (*wanted, *ESTIMATES[:3]) if has_visibility else tuple(wanted),
-        has_visibility,
-    )
+    rules = _rules(options, len(pairs), farthest_min_pairs, wanted)
     width, height = target.size
     result = _Arrays(wanted, height, width)
     num_points = 0
@@ -116,6 +106,22 @@ def fuse_view(
         result.rgb, result.valid, result.depths, result.counts[0], result.counts[1], result.source,
         result.depth_source, tuple(images), len(pairs), rules.min_pairs, num_points, status,
     )  # fmt: skip
+
+
+def _rules(
+    options: FuseOptions, num_pairs: int, farthest_min_pairs: int, wanted: Sequence[str]
+) -> FusionRules:
+    has_visibility = options.visibility and "consensus" in wanted
+    return FusionRules(
+        options.tolerance,
+        max(1, min(options.min_pairs, num_pairs)),
+        options.min_cameras,
+        options.max_front,
+        farthest_min_pairs,
+        # What the visibility test chooses among, whether it is coloured or not.
+        (*wanted, *ESTIMATES[:3]) if has_visibility else tuple(wanted),
+        has_visibility,
+    )
 
 
 class _Arrays:
