@@ -1,6 +1,8 @@
 """Films that play everywhere."""
 
+import contextlib
 import dataclasses
+import os
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -96,7 +98,22 @@ def _add_stream(
     if codec.encoder != "ffv1":
         context.color_primaries = context.color_trc = context.colorspace = 1
         context.color_range = ColorRange.MPEG
+    open_encoder(stream)
     return stream
+
+
+def open_encoder(stream: av.VideoStream) -> None:
+    """Open a stream's encoder, and leave the process scheduled as it was.
+
+    Where it may, as root, SVT-AV1 makes its threads and the caller's real-time ones of the highest priority,
+    and so every process that is started afterwards: nothing else runs on their cores any more.
+    """
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    stream.codec_context.open(strict=False)
+    for thread in Path("/proc/self/task").iterdir():
+        # One that has just ended needs nothing.
+        with contextlib.suppress(ProcessLookupError):
+            os.sched_setscheduler(int(thread.name), policy, parameters)
 
 
 def _stored_frame(image: np.ndarray, index: int, rate: Fraction, codec: Codec) -> av.VideoFrame:

@@ -7,6 +7,8 @@ from pathlib import Path
 import av
 import numpy as np
 
+from fourd.video.encode import open_encoder
+
 TICKS = Fraction(1, 90000)
 SIZE = (64, 48)
 
@@ -47,6 +49,7 @@ def encode_pictures(
     pictures: Sequence[np.ndarray],
     ticks: Sequence[int],
 ) -> None:
+    open_encoder(stream)
     for picture, pts in zip(pictures, ticks, strict=True):
         frame = av.VideoFrame.from_ndarray(picture)
         frame.pts, frame.time_base = pts, TICKS

@@ -37,6 +37,24 @@ def pictures(count: int = 5, size: tuple[int, int] = (96, 64)) -> list[np.ndarra
     return [(40 + 160 * wave).astype(np.uint8) for wave in waves]
 
 
+def policies() -> set[int]:
+    return {os.sched_getscheduler(int(task.name)) for task in Path("/proc/self/task").iterdir()}
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_encoders_leave_the_scheduling_of_threads_alone(tmp_path: Path, codec: str) -> None:
+    """SVT-AV1 as root would make a real-time process of this one, and of all that it starts."""
+    before, seen = policies(), []
+
+    def frames():
+        for picture in pictures():
+            seen.append(policies())
+            yield picture
+
+    encode_video(tmp_path / f"film{CODECS[codec].suffix}", frames(), 25, codec)
+    assert [*seen, policies()] == 6 * [before]
+
+
 @pytest.mark.parametrize("codec", CODECS)
 def test_every_codec_is_read_back(tmp_path: Path, codec: str) -> None:
     path = tmp_path / f"film{CODECS[codec].suffix}"

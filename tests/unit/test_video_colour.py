@@ -6,6 +6,7 @@ import pytest
 
 from fourd.video import probe_video, read_video_frames
 from fourd.video.colour import BT709_FROM_BT2020, REFERENCE_WHITE_NITS, WHITE_16, rgb_image, sdr_from_hdr
+from fourd.video.encode import open_encoder
 from tests.unit.film_files import TICKS, add_video
 
 TRANSFERS = {"hlg": 18, "pq": 16}
@@ -107,6 +108,7 @@ def test_hdr_films_are_recognised_and_mapped(tmp_path: Path, transfer: str, enco
         context = stream.codec_context
         context.colorspace, context.color_range = 9, 1
         context.color_primaries, context.color_trc = 9, TRANSFERS[transfer]
+        open_encoder(stream)
         for index in range(3):
             frame = hdr_frame(signal, transfer)
             frame.pts, frame.time_base = 3000 * index, TICKS
