@@ -90,7 +90,7 @@ def test_results_are_those_of_a_local_run(slurm: None, tmp_path: Path) -> None:
     assert digests(tmp_path) == digests(whole_run().folder)
     allocated = ["sacct", "--allocations", "--noheader", "--parsable2", "--format=Comment,AllocTRES"]
     jobs = subprocess.run(allocated, capture_output=True, text=True, check=True).stdout.splitlines()
-    assert [job.split("|")[0] for job in jobs if "gres/gpu=1" in job] == ["rule_train_level_wildcards_demo_0"]
+    assert [job.split("|")[0] for job in jobs if "gres/gpu=1" in job] == ["rule_train_level_wildcards_0"]
 
 
 def test_job_that_takes_too_much_memory_is_sent_again_with_more(slurm: None, tmp_path: Path) -> None:
