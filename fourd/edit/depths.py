@@ -1,5 +1,6 @@
 """Depth of every input camera's own picture at every frame: what places a mark in the world."""
 
+import dataclasses
 import logging
 import time
 from collections.abc import Sequence
@@ -39,6 +40,9 @@ def run(
             "expected pairs of cameras whose disparity places a mark in the world, got none that could be "
             f"used ({next(iter(disparities.refused.values()), 'no file was given')}): film closer together"
         )
+    # What is carried has to be sure rather than complete: of a sample that one pair has nobody else says
+    # whether it is the thing's or that of what stands beside it.
+    agreed = dataclasses.replace(options, visibility=False)
     progress = Progress("depths of frame", len(frames), time.monotonic)
     with ArchiveWriter(output, {"cameras": list(pictures.names), "pairs": disparities.pairs}) as writer:
         for frame in frames:
@@ -46,7 +50,7 @@ def run(
             images, cameras = pictures.at(frame)
             for name in pictures.names:
                 target = cameras[name].without_distortion()
-                fused = fuse_view(target, pairs, images, cameras, options, ("consensus",))
+                fused = fuse_view(target, pairs, images, cameras, agreed, ("consensus",))
                 writer.add_frame(frame, **{name: fused.depths["consensus"].astype(np.float32)})
             progress.step(f"{len(pictures.names)} cameras")
     disparities.close()
