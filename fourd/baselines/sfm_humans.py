@@ -18,11 +18,11 @@ def render(evidence: Evidence) -> np.ndarray:
     Raises Unavailable where nobody was looked for, or without sparse points.
     """
     # Loaded only where people were fitted: it takes longer than most jobs' other imports.
-    from fourd.baselines.humans import load_body, missing_models
+    from fourd.baselines.humans import NO_MODELS, load_body
     from fourd.baselines.humans.mesh import colour_surface
 
     if evidence.people is None:
-        raise Unavailable(evidence.no_people or missing_models("") or "")
+        raise Unavailable(evidence.no_people or NO_MODELS)
     image = sfm_dense.render(evidence)
     if not len(evidence.people):
         return image

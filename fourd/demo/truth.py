@@ -2,8 +2,10 @@
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from fourd.camera import Camera
 from fourd.demo.cameras import camera_at, camera_tracks, clip_times, middle_time, orbit_cameras
@@ -41,11 +43,9 @@ def write_camera_labels(
 
     of_phone: the frames are those of the phone's film instead of the synchronised ones
     """
-    times = make_phone(name, options).frame_times if of_phone else clip_times(options)
     with atomic_folder(output) as folder:
-        for frame, time_s in enumerate(times):
-            scene = FrozenScene(float(time_s), options, without)
-            write_png(folder / f"{frame:06d}.png", scene.trace(camera_at(name, float(time_s), options))[1])
+        for frame, (_, labels) in enumerate(_trace_frames(name, options, without, of_phone)):
+            write_png(folder / f"{frame:06d}.png", labels)
 
 
 def write_camera_depths(
@@ -53,14 +53,20 @@ def write_camera_depths(
 ) -> None:
     """Write the depth of one camera's frames to OUTPUT/000000.npz ...: `z`, metres, infinite in the sky.
 
-    of_phone: the frames are those of the phone's film instead of the synchronised ones
+    of_phone: as for the labels
     """
-    times = make_phone(name, options).frame_times if of_phone else clip_times(options)
     with atomic_folder(output) as folder:
-        for frame, time_s in enumerate(times):
-            scene = FrozenScene(float(time_s), options, without)
+        for frame, (depth, _) in enumerate(_trace_frames(name, options, without, of_phone)):
             with ArchiveWriter(folder / f"{frame:06d}.npz") as archive:
-                archive.add("z", scene.trace(camera_at(name, float(time_s), options))[0])
+                archive.add("z", depth)
+
+
+def _trace_frames(
+    name: str, options: DemoOptions, without: Sequence[int], of_phone: bool
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(H, W) depth, metres, and (H, W) uint8 labels of each frame of one camera."""
+    for time_s in make_phone(name, options).frame_times if of_phone else clip_times(options):
+        yield FrozenScene(float(time_s), options, without).trace(camera_at(name, float(time_s), options))
 
 
 def write_cameras(output: Path | str, options: DemoOptions) -> None:

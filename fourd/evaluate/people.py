@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fourd.baselines.humans import load_models, missing_models
+from fourd.baselines.humans import NO_MODELS, load_models, missing_models
 from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.image import undistort
@@ -74,7 +74,7 @@ def read_people(path: Path | None, humans: str) -> tuple[dict[int, np.ndarray], 
     path: of `run_people`, None where it was not asked for. Raises InputError for another file.
     """
     if path is None:
-        return {}, HOW_TO_MAKE if humans else (missing_models("") or "")
+        return {}, HOW_TO_MAKE if humans else NO_MODELS
     archive = Archive(path)
     try:
         if archive.meta.get("status") != OK:

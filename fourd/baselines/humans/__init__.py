@@ -26,6 +26,7 @@ HOW_TO_GET = (
     "install the extra `humans` (pip install 'fourd[humans]'), run `python -m fourd.fetch humans "
     "--output DIR` and set evaluate humans to DIR"
 )
+NO_MODELS = f"no models are given: {HOW_TO_GET}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,7 +57,7 @@ class HumanModels:
 def missing_models(folder: str) -> str | None:
     """Why people cannot be fitted, None if they can."""
     if not folder:
-        return f"no models are given: {HOW_TO_GET}"
+        return NO_MODELS
     for part in (POSE_FOLDER, BODY_FOLDER):
         if not (Path(folder) / part).is_dir():
             return f"no folder {Path(folder) / part}: {HOW_TO_GET}"
