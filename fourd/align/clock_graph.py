@@ -100,28 +100,33 @@ def drop_inconsistent(
     """
     kept = list(pairs)
     notes: list[str] = []
-    while True:
-        loops = [(loop, _loop_error_s(loop)) for loop in _triplets(kept)]
-        failed = [
-            (loop, error)
-            for loop, error in loops
-            if abs(error) > tolerance_s + 4 * math.hypot(*(pair.sigma_s for pair in loop))
-        ]
-        if not failed:
-            return kept, tuple(notes)
-        blame = {(pair.left, pair.right): 0 for pair in kept}
-        for loop, _ in loops:
-            is_failed = any(loop is other for other, _ in failed)
-            for pair in loop:
-                blame[pair.left, pair.right] += 1 if is_failed else -1
-        suspects = {id(pair): pair for loop, _ in failed for pair in loop}.values()
-        worst = max(suspects, key=lambda pair: (blame[pair.left, pair.right], -pair.score))
-        misses = [abs(error) for loop, error in failed if worst in loop]
+    while failed := [loop for loop in _triplets(kept) if not _closes(loop, tolerance_s)]:
+        balance = count_closing(kept, tolerance_s)
+        suspects = {id(pair): pair for loop in failed for pair in loop}.values()
+        worst = min(suspects, key=lambda pair: (balance[pair.left, pair.right], pair.score))
+        misses = [abs(_loop_error_s(loop)) for loop in failed if worst in loop]
         kept.remove(worst)
         notes.append(
             f"the delay of {worst.left} and {worst.right} was dropped: {len(misses)} triplets of cameras do "
             f"not close with it, by {float(np.median(misses)):.3f} s"
         )
+    return kept, tuple(notes)
+
+
+def count_closing(
+    pairs: Sequence[PairDelay], tolerance_s: float = LOOP_TOLERANCE_S
+) -> dict[tuple[str, str], int]:
+    """By (left, right): triplets of cameras around which the delays add up to 0, less those that fail."""
+    balance = {(pair.left, pair.right): 0 for pair in pairs}
+    for loop in _triplets(pairs):
+        sign = 1 if _closes(loop, tolerance_s) else -1
+        for pair in loop:
+            balance[pair.left, pair.right] += sign
+    return balance
+
+
+def _closes(loop: tuple[PairDelay, PairDelay, PairDelay], tolerance_s: float) -> bool:
+    return abs(_loop_error_s(loop)) <= tolerance_s + 4 * math.hypot(*(pair.sigma_s for pair in loop))
 
 
 def _triplets(pairs: Sequence[PairDelay]) -> list[tuple[PairDelay, PairDelay, PairDelay]]:

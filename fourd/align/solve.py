@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fourd.align.clock import PPM, CameraClock, Offsets, PairDelay
-from fourd.align.clock_graph import attach_clock, correct_sound_travel, solve_clocks
+from fourd.align.clock_graph import attach_clock, correct_sound_travel, count_closing, solve_clocks
 from fourd.align.epipolar_motion import EpipolarMatch, compare_motion
 from fourd.align.listen import SAME_RECORDING, TRAVEL_SIGMA_S
 from fourd.align.motion_maps import MotionMaps
@@ -116,11 +116,12 @@ def merge_pairs(
 ) -> tuple[list[PairDelay], tuple[str, ...]]:
     """One delay per pair of cameras from sound and sight, and notes where the two contradict each other.
 
-    Agreeing delays are weighted by their variances. Of contradicting ones sight is taken: an echo or
-    other music can deceive sound, but nothing puts moving points onto their epipolar planes by chance.
+    Agreeing delays are weighted by their variances. Of contradicting ones that is taken with which more
+    triplets of cameras close; of equals sight: a film's sound may lie beside its pictures, and an echo or
+    other music can deceive it. Sight errs where a walk of few steps looks alike one step later.
     """
     merged = {(p.left, p.right): p for p in heard if p.status == "ok"}
-    notes = []
+    contradicted: dict[tuple[str, str], tuple[PairDelay, float]] = {}
     for pair in seen:
         if pair.status != "ok":
             continue
@@ -132,11 +133,7 @@ def merge_pairs(
         # Sight knows the delay at its time_s only; sound knows how it changes.
         difference_s = pair.delay_s - sound.delay_s - sound.rate_ppm * PPM * pair.time_s
         if abs(difference_s) > MAX_SIGMAS * math.hypot(sound.sigma_s, pair.sigma_s):
-            notes.append(
-                f"{pair.left} and {pair.right}: sight differs from sound by {1e3 * difference_s:+.1f} ms, "
-                "more than their doubts allow; sight is taken"
-            )
-            merged[key] = pair
+            contradicted[key] = pair, difference_s
             continue
         weights = np.array([sound.sigma_s, pair.sigma_s]) ** -2.0
         merged[key] = dataclasses.replace(
@@ -145,6 +142,17 @@ def merge_pairs(
             sigma_s=float(weights.sum() ** -0.5),
             score=max(sound.score, pair.score),
             method="audio+vision",
+        )
+    by_sound = count_closing(list(merged.values()))
+    by_sight = count_closing(list((merged | {key: pair for key, (pair, _) in contradicted.items()}).values()))
+    notes = []
+    for key, (pair, difference_s) in contradicted.items():
+        is_seen = by_sight[key] >= by_sound[key]
+        merged[key] = pair if is_seen else merged[key]
+        reason = "sight is taken" if is_seen else "sound is taken, with which more triplets of cameras close"
+        notes.append(
+            f"{pair.left} and {pair.right}: sight differs from sound by {1e3 * difference_s:+.1f} ms, more "
+            f"than their doubts allow; {reason}"
         )
     return list(merged.values()), tuple(notes)
 
