@@ -10,7 +10,8 @@ Writes composition.csv (one row per variant, mark and camera, means over frames;
 error over that of the better one of `inst`, the consensus, and `paste`, the consensus over the background),
 composition.png (RMS error over all cameras against time) and, per camera, composition_CAMERA.png: what each
 variant makes of the middle frame. Peak memory is the process': compare it between runs of one variant each.
-`paper` is the preset of that name with this bench's filters and crop.
+`paper` is the preset of that name with this bench's filters and crop. LPIPS (AlexNet) is measured, and
+`perceptual` can be trained, where --lpips-weights says where its weights are.
 """
 
 import argparse
@@ -36,6 +37,7 @@ from fourd.evaluate import EvaluateOptions
 from fourd.evaluate.regions import StillPicture, find_dynamic_pixels, read_dynamic_mask
 from fourd.image import label_image, tile_images, undistort
 from fourd.ingest import open_camera
+from fourd.metrics_lpips import lpips
 from fourd.sfm import SceneCameras, read_cameras
 from fourd.views import LEFT_OUT, read_view
 
@@ -45,8 +47,8 @@ CLOSEST, MEDIAN, ONE = (1, 1, 1, 3, 3, 3), (2, 2, 2, 3, 3, 3), (0, 0, 0, 3, 3, 3
 STILL_FRAMES = 15
 CAPTION_PX = 18
 COLUMNS = (
-    "variant", "mark_s", "steps", "view", "psnr_db", "dynamic_psnr_db", "ssim", "mse", "mse_share", "seconds",
-    "cpu_seconds", "peak_rss_mb",
+    "variant", "mark_s", "steps", "view", "psnr_db", "dynamic_psnr_db", "ssim", "lpips", "mse", "mse_share",
+    "seconds", "cpu_seconds", "peak_rss_mb",
 )  # fmt: skip
 
 
@@ -85,6 +87,7 @@ VARIANTS = {
     "not_averaged": Variant({"average_weights": False}),
     "not_resized": Variant({"min_scale": 1.0}),
     "enlarged": Variant({"min_scale": 1.0, "max_scale": 1.5}),
+    "perceptual": Variant({"perceptual_weight": 20.0}),
 }
 
 
@@ -166,8 +169,11 @@ def read_heldout(folder: Path, scene: SceneCameras, cam: str, labels: Path | Non
     film.close()
 
 
-def measure_image(image: np.ndarray, frame: HeldOutFrame) -> dict[str, float]:
-    """psnr_db, dynamic_psnr_db, ssim and mse; pixels that the truth does not have do not count."""
+def measure_image(image: np.ndarray, frame: HeldOutFrame, lpips_weights: str = "") -> dict[str, float]:
+    """psnr_db, dynamic_psnr_db, ssim, lpips and mse; pixels that the truth does not have do not count.
+
+    lpips_weights: folder of the weights; without one there is no lpips, NaN
+    """
     truth = frame.images[data.TARGET, ..., :3]
     shown = np.where(frame.valid[..., None], image, np.uint8(0))
     mse = metrics.mse(shown, truth, frame.valid)
@@ -175,6 +181,7 @@ def measure_image(image: np.ndarray, frame: HeldOutFrame) -> dict[str, float]:
         "psnr_db": metrics.psnr_from_mse(mse),
         "dynamic_psnr_db": metrics.psnr(shown, truth, frame.dynamic),
         "ssim": metrics.ssim(shown, truth),
+        "lpips": lpips(shown, truth, lpips_weights) if lpips_weights else math.nan,
         "mse": mse,
     }
 
@@ -185,16 +192,15 @@ def average_frames(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {key: float(np.mean(values)) if values else math.nan for key, values in columns.items()}
 
 
-def measure_baselines(frames: Sequence[HeldOutFrame]) -> dict[str, tuple[dict[str, float], np.ndarray]]:
+def measure_baselines(
+    frames: Sequence[HeldOutFrame], lpips_weights: str = ""
+) -> dict[str, tuple[dict[str, float], np.ndarray]]:
     """Inst and Inst over background, as `measure_networks`."""
     images = {
         "inst": [frame.images[CONSENSUS, ..., :3] for frame in frames],
         "paste": [paste_images(frame.images) for frame in frames],
     }
-    return {
-        name: (average_frames(list(map(measure_image, found, frames))), found[len(found) // 2])
-        for name, found in images.items()
-    }
+    return {name: summarize(found, frames, lpips_weights) for name, found in images.items()}
 
 
 def compose_images(networks: Sequence[CompositionNet], images: np.ndarray) -> np.ndarray:
@@ -206,11 +212,17 @@ def compose_images(networks: Sequence[CompositionNet], images: np.ndarray) -> np
 
 
 def measure_networks(
-    networks: Sequence[CompositionNet], frames: Sequence[HeldOutFrame]
+    networks: Sequence[CompositionNet], frames: Sequence[HeldOutFrame], lpips_weights: str = ""
 ) -> tuple[dict[str, float], np.ndarray]:
     """Means over frames, and the picture of the middle one."""
-    found = [compose_images(networks, frame.images) for frame in frames]
-    return average_frames(list(map(measure_image, found, frames))), found[len(found) // 2]
+    return summarize([compose_images(networks, frame.images) for frame in frames], frames, lpips_weights)
+
+
+def summarize(
+    found: Sequence[np.ndarray], frames: Sequence[HeldOutFrame], lpips_weights: str
+) -> tuple[dict[str, float], np.ndarray]:
+    rows = [measure_image(image, frame, lpips_weights) for image, frame in zip(found, frames, strict=True)]
+    return average_frames(rows), found[len(found) // 2]
 
 
 def train_variant(
@@ -243,7 +255,9 @@ def measure_variants(
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], np.ndarray]]:
     """Rows of the table, those without training first, and a picture by camera and variant."""
     rows, pictures = [], {}
-    baselines = {view: measure_baselines(frames) for view, frames in event.heldout.items()}
+    baselines = {
+        view: measure_baselines(frames, options.lpips_weights) for view, frames in event.heldout.items()
+    }
     best = {view: min(row["mse"] for row, _ in found.values()) for view, found in baselines.items()}
 
     def keep(name: str, view: str, facts: dict[str, Any], picture: np.ndarray) -> None:
@@ -259,7 +273,7 @@ def measure_variants(
     for name in names:
         for cost, networks in train_variant(event, VARIANTS[name], options, marks):
             for view, frames in event.heldout.items():
-                scores, picture = measure_networks(networks, frames)
+                scores, picture = measure_networks(networks, frames, options.lpips_weights)
                 keep(name, view, cost | scores, picture)
     return rows, pictures
 
@@ -286,12 +300,17 @@ def draw_sheet(pictures: Mapping[str, np.ndarray]) -> np.ndarray:
     return tile_images([tiles[i : i + 3] for i in range(0, len(tiles), 3)], 2)
 
 
+def needs_lpips(variant: Variant) -> bool:
+    return variant.changes.get("perceptual_weight", 0) > 0
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--scene", type=Path, required=True)
     parser.add_argument("--labels", type=Path, help="folder of the true masks, one folder per camera")
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="NAME",
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, metavar="NAME",
                         help=", ".join(VARIANTS))  # fmt: skip
+    parser.add_argument("--lpips-weights", default="", metavar="DIR", help="folder of `fourd.fetch lpips`")
     parser.add_argument("--marks", type=float, nargs="+", default=[60, 180], help="s of processor time")
     parser.add_argument("--num-filters", type=int, default=8)
     parser.add_argument("--crop", type=int, default=192)
@@ -300,8 +319,16 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser.parse_args(argv)
     cli.set_num_threads(1)
     event = read_event(args.scene, args.labels)
-    options = CompositionOptions(num_filters=(args.num_filters,) * 3, crop=args.crop, seed=args.seed)
-    rows, pictures = measure_variants(event, args.variants, options, args.marks)
+    options = CompositionOptions(
+        num_filters=(args.num_filters,) * 3,
+        crop=args.crop,
+        seed=args.seed,
+        lpips_weights=args.lpips_weights,
+    )
+    names = args.variants or [
+        name for name, variant in VARIANTS.items() if args.lpips_weights or not needs_lpips(variant)
+    ]
+    rows, pictures = measure_variants(event, names, options, args.marks)
     io.write_csv(args.output / "composition.csv", COLUMNS, rows)
     trained = average_views([row for row in rows if row["steps"]])
     plot_curves(args.output / "composition.png", trained, "variant", "default", "rms_error")

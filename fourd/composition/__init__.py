@@ -1,12 +1,13 @@
 """Self-supervised composition of instantaneous foreground and static background (section 3.3, 4).
 
-`model` is the network, `losses` what it minimises, `data` the samples, `train` the page that fits
-it to a scene, `validation` how well that goes, `infer` its use: one frame through the levels, coarse to fine.
+`model` is the network, `losses` and `perceptual` what it minimises, `data` the samples, `train` the page
+that fits it to a scene, `validation` how well that goes, `infer` its use: one frame through the levels,
+coarse to fine.
 """
 
 import dataclasses
 
-STAGE_VERSION = 4
+STAGE_VERSION = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,6 +22,8 @@ class CompositionOptions:
     l1_weight: float = 100.0
     adversarial_weight: float = 0.0
     frequency_weight: float = 100.0
+    perceptual_weight: float = 0.0
+    lpips_weights: str = ""
     average_weights: bool = True
     epochs: int = 10
     learning_rate: float = 1e-3

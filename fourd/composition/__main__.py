@@ -27,7 +27,10 @@ from fourd.views import LEFT_OUT, View, read_view
 log = logging.getLogger("fourd.composition")
 
 # What may change between a run and its continuation without changing the weights at a step.
-NOT_IN_FINGERPRINT = ("epochs", "patience", "max_minutes", "checkpoint_s", "cache_mb", "tensorboard")
+# The weights of LPIPS are the same ones in whatever folder they lie.
+NOT_IN_FINGERPRINT = (
+    "epochs", "patience", "max_minutes", "checkpoint_s", "cache_mb", "tensorboard", "lpips_weights",
+)  # fmt: skip
 
 # Below it, resampling would skip pixels.
 MIN_SCALE = 0.5

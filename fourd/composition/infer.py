@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 
-from fourd.composition import CascadeOptions
+from fourd.composition import STAGE_VERSION, CascadeOptions
 from fourd.composition.checkpoint import read_torch
 from fourd.composition.data import (
     ESTIMATES,
@@ -52,7 +52,13 @@ def load_models(paths: Sequence[Path], device: str = "cpu") -> list[CompositionN
 
 def _network(document: Mapping[str, Any], device: str) -> CompositionNet:
     network = CompositionNet(**document["network"])
-    network.load_state_dict(document["state_dict"])
+    try:
+        network.load_state_dict(document["state_dict"])
+    except RuntimeError:
+        raise InputError(
+            f"expected a model of stage version {STAGE_VERSION} for level {document['level']}, got that of "
+            f"another network (version {document.get('stage_version', 'unknown')}): train it again"
+        ) from None
     return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 

@@ -118,7 +118,8 @@ class CompositionNet(nn.Module):
     unet_width:  filters of the U-Net's first scale in units of n_f
     depth:       halvings of the U-Net
     head:        `direct`, three convolutions give the image (the paper); or `blend`, they give
-                 weights over the six inputs and an additive correction
+                 weights over the six inputs and an additive correction, and the U-Net is also told how
+                 the inputs differ
     level:       0 is the coarsest; it sets the padding
     streams:     of `TEST_STREAMS`; `test_streams` says which estimates it is to be given at test
 
@@ -138,7 +139,8 @@ class CompositionNet(nn.Module):
         stream = [STREAM_CHANNELS] + [num_filters] * 3
         width = unet_width * num_filters
         self.streams = nn.ModuleList(convolutions(stream) for _ in range(NUM_STREAMS))
-        self.unet = UNet(NUM_STREAMS * num_filters, width, depth)
+        num_differences = 0 if head == "direct" else NUM_STREAMS * 3
+        self.unet = UNet(NUM_STREAMS * num_filters + num_differences, width, depth)
         num_out = 3 if head == "direct" else NUM_STREAMS + 1 + 3
         last = nn.Conv2d(width, num_out, 3, padding=1)
         self.output = nn.Sequential(*convolutions([width, width, width]), last)
@@ -162,6 +164,8 @@ class CompositionNet(nn.Module):
         padded = pad(streams, padded_size(*size, self.level))
         with autocast(streams.device.type, precision):
             encoded = [self.run_block(stream, padded[:, i]) for i, stream in enumerate(self.streams)]
+            if self.head == "blend":
+                encoded.append(compare(padded).to(encoded[0].dtype))
             features = self.unet(torch.cat(encoded, dim=1), self.run_block)
             features = self.run_block(self.output[:-1], features)
         # Always in full precision: 8 bits of mantissa are coarser than a grey level.
@@ -180,6 +184,16 @@ def paste(streams: Tensor) -> tuple[Tensor, Tensor]:
         image = torch.where(filled > 0, image, colour * valid)
         filled = torch.maximum(filled, valid)
     return image, filled
+
+
+def compare(streams: Tensor) -> Tensor:
+    """(B, 18, H, W): what each stream's colours are above those of the paste, 0 where it is invalid.
+
+    Which estimate to believe shows in which ones agree, and that can be read from streams encoded one by one
+    only after all of them have learned the same code.
+    """
+    image, _ = paste(streams)
+    return ((streams[:, :, :3] - image.unsqueeze(1)) * streams[:, :, 3:]).flatten(1, 2)
 
 
 def fill_blanks(image: Tensor, filled: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from fourd import metrics
 from fourd.composition import CompositionOptions, data, losses
 from fourd.composition.checkpoint import Checkpoint, Progress, StopRequest
 from fourd.composition.model import CompositionNet, Discriminator, autocast
+from fourd.composition.perceptual import PerceptualLoss
 from fourd.composition.validation import Report, compose_samples, is_stale, measure
 from fourd.errors import InputError
 
@@ -22,7 +23,7 @@ log = logging.getLogger("fourd.composition")
 MAX_SKIPPED_IN_A_ROW = 3
 # The average of the weights reaches back over about a ninth of the steps so far, whatever their number.
 AVERAGE_POWER = 8
-LOSSES = ("reconstruction", "frequency", "adversarial", "discriminator", "train_psnr_db")
+LOSSES = ("reconstruction", "frequency", "perceptual", "adversarial", "discriminator", "train_psnr_db")
 COLUMNS = ("epoch", "step", "seconds", *LOSSES, "validation_psnr_db", "paste_psnr_db", "skipped_steps")
 
 
@@ -51,6 +52,9 @@ class Trainer:
         # The average starts at the first step, so what the copy holds until then does not count.
         self.average = (
             copy.deepcopy(self.generator).requires_grad_(False) if options.average_weights else None
+        )
+        self.perceptual_loss = (
+            PerceptualLoss(options.lpips_weights, device) if options.perceptual_weight > 0 else None
         )
         rate = options.learning_rate
         self.generator_optimizer = torch.optim.Adam(self.generator.parameters(), lr=rate, fused=True)
@@ -108,6 +112,10 @@ def update(
         "frequency": losses.frequency_loss(output, target, valid),
     }
     loss = options.l1_weight * terms["reconstruction"] + options.frequency_weight * terms["frequency"]
+    if trainer.perceptual_loss is not None:
+        with cast():
+            terms["perceptual"] = trainer.perceptual_loss(output, target, valid)
+        loss = loss + options.perceptual_weight * terms["perceptual"]
     if not torch.isfinite(loss):
         return None
     if options.adversarial_weight > 0:

@@ -72,6 +72,7 @@ def test_rows_say_what_a_variant_reaches_at_a_mark(event):
         assert 0 < early["steps"] < late["steps"]
         assert early["cpu_seconds"] >= 0.02 and late["cpu_seconds"] >= 0.05
         assert late["mse_share"] == late["mse"] / 100
+    assert np.isnan(rows[1]["lpips"])
     assert set(pictures) == {("held", name) for name in ("inst", "paste", "default", "input_closest")}
     assert draw_sheet({name: picture for (_, name), picture in pictures.items()}).shape[1] == 3 * 24 + 4
     means = average_views(rows[2:])

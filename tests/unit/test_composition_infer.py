@@ -176,3 +176,12 @@ def test_missing_file_and_unequal_sizes_are_refused(tmp_path):
     background = {key: array[:-2] for key, array in background.items()}
     with pytest.raises(InputError, match="one size"):
         infer.paste(foreground, background)
+
+
+def test_model_of_another_network_is_refused(tmp_path):
+    (path,) = write_models(tmp_path, 1)
+    document = torch.load(path, weights_only=True)
+    document["network"] |= {"head": "direct"}
+    save_torch(path, document)
+    with pytest.raises(InputError, match="level 0, .* another network .*train it again"):
+        infer.load_models([path])

@@ -72,6 +72,27 @@ def test_each_stream_sees_its_own_input_only():
     assert weights[1].grad.abs().sum() > 0
 
 
+def test_comparison_is_with_the_paste_and_says_nothing_of_blanks():
+    streams = random_streams(12, 20)
+    found = model.compare(streams).reshape(1, 6, 3, 12, 20)
+    pasted, _ = model.paste(streams)
+    valid = streams[:, :, 3:].expand_as(found) > 0
+    assert torch.equal(found[~valid], torch.zeros_like(found[~valid]))
+    assert torch.equal(found[valid], (streams[:, :, :3] - pasted[:, None])[valid])
+    consensus = streams[:, 0, 3] > 0
+    assert not found[:, 0].any()
+    assert torch.equal(
+        found[:, 3].movedim(1, -1)[consensus],
+        ((streams[:, 3, :3] - streams[:, 0, :3]) * streams[:, 3, 3:]).movedim(1, -1)[consensus],
+    )
+
+
+def test_direct_head_compares_nothing():
+    """The paper's U-Net is given the features of the streams, and no more."""
+    narrow, wide = (CompositionNet(4, 1, 2, head, 0).unet.down[0][0] for head in ("direct", "blend"))
+    assert (narrow.in_channels, wide.in_channels) == (24, 24 + 18)
+
+
 def test_blend_starts_as_the_paste_exactly():
     torch.manual_seed(0)
     streams = random_streams(30, 40)
