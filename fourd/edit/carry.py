@@ -147,8 +147,9 @@ def find_frame(
         ours = splat_points(instant.cameras[name], points, side)
         theirs = splat_points(instant.cameras[name], others, side)
         masks[name] = refine_outline(image, kind, ours < theirs, instant.plate_finder(name, points))
-        is_mover &= ~widen(masks[name], RIM_PX)
-        kinds[name] = np.where(masks[name], OBJECT, np.where(is_mover, OTHER, UNKNOWN)).astype(np.uint8)
+        # What lies in another one's rim is not handed on, or whatever touches the thing would follow it.
+        sure, theirs_alone = masks[name] & (ours < theirs), is_mover & ~widen(masks[name], RIM_PX)
+        kinds[name] = np.where(sure, OBJECT, np.where(theirs_alone, OTHER, UNKNOWN)).astype(np.uint8)
     return Found(masks, kinds, points, others, still)
 
 

@@ -33,13 +33,14 @@ def refine_outline(
 
     image: (H, W, 3) uint8;  kind: (H, W) uint8 OBJECT, MOVER (another one), OTHER (stands still) or UNKNOWN
     by this picture's own depth
-    likely: (H, W) bool where other cameras see the thing
+    likely: (H, W) bool where other cameras see the thing, and nobody before it
     find_plate: gives (h, w, 3) uint8 what stands still in a window, and (h, w) bool where that is known
     What lies well inside or outside stays. Along the outline, and where nobody knows, what looks as it does
-    at other times is not the thing; the rest is cut by colour.
+    at other times is not the thing; the rest is cut by colour. Where another one is in front, its depth is
+    too wide as well, so the rim of it may be the thing's.
     Source of the cut: C. Rother et al., "GrabCut", SIGGRAPH 2004.
     """
-    inside = cv2.morphologyEx(((kind == OBJECT) & likely).astype(np.uint8), cv2.MORPH_CLOSE, _disc(2))
+    inside = cv2.morphologyEx((kind == OBJECT).astype(np.uint8), cv2.MORPH_CLOSE, _disc(2))
     inside[kind == OTHER] = 0
     inside[(kind == UNKNOWN) & likely] = 1
     inside = _without_specks(inside)
@@ -51,13 +52,15 @@ def refine_outline(
     same = known & is_plate(picture, plate)
     differs = known & ~same
     near = (cv2.dilate(part, _disc(_OUTER_PX)) > 0) | _find_limbs(part, differs, told)
-    core = cv2.erode(part, _disc(_INNER_PX)) > 0
+    mover = ((told == MOVER) & (part == 0)).astype(np.uint8)
+    core = (part > 0) & (cv2.erode(part | mover, _disc(_INNER_PX)) > 0)
     edge = (cv2.erode(part, _disc(_EDGE_PX)) == 0) & (part > 0)
     trimap = np.full(part.shape, cv2.GC_BGD, np.uint8)
     trimap[near & ~same] = cv2.GC_PR_BGD
     trimap[near & differs] = cv2.GC_PR_FGD
     trimap[(told == OTHER) & ~maybe & (cv2.dilate(part, _disc(1)) == 0) & ~differs] = cv2.GC_BGD
-    trimap[(told == MOVER) & (part == 0)] = cv2.GC_BGD
+    trimap[mover > 0] = cv2.GC_BGD
+    trimap[_find_contact(part, mover) & differs] = cv2.GC_PR_BGD
     trimap[(told == OTHER) & maybe & (part == 0) & ~same] = cv2.GC_PR_FGD
     trimap[part > 0] = cv2.GC_PR_FGD
     trimap[core & ~same] = cv2.GC_FGD
@@ -71,6 +74,12 @@ def refine_outline(
     mask = np.zeros(kind.shape, bool)
     mask[window] = _without_specks(cut) > 0
     return mask
+
+
+def _find_contact(part: np.ndarray, mover: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the rim of another one that is next to the part, both (h, w) uint8."""
+    rim = (mover > 0) & (cv2.erode(mover, _disc(_OUTER_PX + 1)) == 0)
+    return rim & (cv2.dilate(part, _disc(_OUTER_PX)) > 0)
 
 
 def _find_limbs(part: np.ndarray, differs: np.ndarray, told: np.ndarray) -> np.ndarray:

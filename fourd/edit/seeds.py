@@ -94,7 +94,7 @@ def _check_mark(mark: Mark, mask: np.ndarray, has_depth: np.ndarray, moving: np.
 
 
 def _drop_passers(instant: Instant, hints: Mapping[str, np.ndarray], side: float) -> dict[str, np.ndarray]:
-    """Hints without the parts that a box only touches."""
+    """Hints without the parts that a box only touches, and those that lie apart from its largest one."""
     voxels = voxels_of(instant, side)
     parts = find_parts(voxels)
     num = int(parts.max()) + 1 if len(parts) else 0
@@ -104,12 +104,30 @@ def _drop_passers(instant: Instant, hints: Mapping[str, np.ndarray], side: float
         for counts, label in ((ours, OBJECT), (theirs, OTHER)):
             counts += np.bincount(parts[at[(at >= 0) & (hint == label)]], minlength=num)
     passes = ours < theirs
+    if num:
+        passes |= find_strangers(voxels.centers, parts, np.where(passes, 0, ours))
     result = {}
     for name, hint in hints.items():
         at = voxels.index[name]
         is_passer = (at >= 0) & passes[parts[np.maximum(at, 0)]] if num else np.zeros(at.shape, bool)
         result[name] = np.where(is_passer & (hint == OBJECT), OTHER, hint).astype(np.uint8)
     return result
+
+
+def find_strangers(centers: np.ndarray, parts: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(P,) bool parts that lie farther from the part with most counts, (P,), than they are long themselves.
+
+    What a missing depth cuts off from a figure is longer than the gap.
+    """
+    main = int(counts.argmax())
+    gaps = distances_to(centers, centers[parts == main], np.inf)
+    nearest = np.full(len(counts), np.inf)
+    low = np.full((len(counts), 3), np.inf)
+    np.minimum.at(nearest, parts, gaps)
+    np.minimum.at(low, parts, centers)
+    high = np.full(low.shape, -np.inf)
+    np.maximum.at(high, parts, centers)
+    return nearest > np.linalg.norm(high - low, axis=1)
 
 
 def merge_hints(several: list[tuple[Mark, dict[str, np.ndarray]]]) -> dict[str, np.ndarray]:

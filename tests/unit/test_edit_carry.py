@@ -8,11 +8,21 @@ import pytest
 
 from fourd.edit.carry import VOXEL_PX, carry_flow, carry_mark, find_rest, splat_points
 from fourd.edit.moving import find_moving, project_ideal, sample_depth, world_points
+from fourd.edit.outline import refine_outline
 from fourd.edit.plate import is_plate, plate_of
-from fourd.edit.seeds import hints_of_hidden, hints_of_mark, merge_hints
+from fourd.edit.seeds import find_strangers, hints_of_hidden, hints_of_mark, merge_hints
 from fourd.edit.single import follow_mask
 from fourd.edit.spec import Mark
-from fourd.edit.voxels import OBJECT, OTHER, UNKNOWN, distances_to, gather_voxels, settle_labels, vote_labels
+from fourd.edit.voxels import (
+    MOVER,
+    OBJECT,
+    OTHER,
+    UNKNOWN,
+    distances_to,
+    gather_voxels,
+    settle_labels,
+    vote_labels,
+)
 from fourd.errors import InputError
 from tests.unit import edit_scene as scene
 
@@ -117,6 +127,31 @@ def test_a_box_means_what_lies_mostly_inside() -> None:
     mark = Mark("cam01", 1, "box", ((float(x.min()), float(y.min())), (float(x.max()), float(y.max()))))
     hints = hints_of_mark(load(1), mark, mask, scene.camera("cam01"), SIDE)
     assert (label("cam00", 1)[hints["cam00"] == OBJECT] == GREEN).mean() > 0.95
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_a_ball_before_the_marked_thing_is_another_one_and_a_leg_is_not(scale: float) -> None:
+    body, leg, ball = np.zeros((9, 3)), np.zeros((6, 3)), np.zeros((3, 3))
+    body[:, 1], leg[:, 1], ball[:, 1] = np.arange(9), 13 + np.arange(6), np.arange(3)
+    ball[:, 2] = -6
+    centers = scale * np.concatenate([body, leg, ball])
+    parts = np.repeat([0, 1, 2], [9, 6, 3])
+    assert find_strangers(centers, parts, np.array([90.0, 60.0, 30.0])).tolist() == [False, False, True]
+
+
+def test_the_rim_of_who_stands_before_the_thing_goes_by_colour() -> None:
+    """The red one's depth is three pixels too wide: there the green one still shows."""
+    image = np.random.default_rng(0).integers(60, 80, (60, 60, 3)).astype(np.uint8)
+    plate = image.copy()
+    image[10:50, 15:30] = image[10:50, 15:30] // 4 + np.array([0, 150, 0], np.uint8)
+    image[10:50, 30:50] = image[10:50, 30:50] // 4 + np.array([150, 0, 0], np.uint8)
+    kind = np.full((60, 60), OTHER, np.uint8)
+    kind[10:50, 15:27], kind[10:50, 27:50] = OBJECT, MOVER
+    known = np.ones((60, 60), bool)
+    mask = refine_outline(image, kind, kind == OBJECT, lambda window: (plate[window], known[window]))
+    truth = np.zeros((60, 60), bool)
+    truth[10:50, 15:30] = True
+    assert iou(kind == OBJECT, truth) < 0.85 < 0.97 < iou(mask, truth)
 
 
 def test_a_mark_on_a_view_without_a_film_means_the_same() -> None:
