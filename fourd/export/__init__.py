@@ -10,7 +10,7 @@ import importlib.util
 
 from fourd.errors import InputError
 
-STAGE_VERSION = 1
+STAGE_VERSION = 2
 # Formats of the event's cameras, pictures and points; and of rendered films.
 EVENT_FORMATS = (
     "colmap",

@@ -19,7 +19,7 @@ from fourd.io import write_text
 
 Cameras = Mapping[str, Camera]
 TOML_FLAVOURS = ("pose2sim", "anipose", "caliscope")
-# Qualisys: x right, y up, z backward, millimetres, and pixels in 64 parts.
+# Qualisys: x right, y up, z backward, millimetres, and pixels in 64 parts; windows include their last pixel.
 OPENCV_FROM_QUALISYS = np.diag([1.0, -1.0, -1.0])
 MILLIMETRES = 1000.0
 PARTS_OF_PIXEL = 64.0
@@ -86,16 +86,16 @@ def qualisys_text(cameras: Cameras) -> str:
             {"active": "1", "avg-residual": "0", "serial": name, "viewrotation": "0", "model": "none"},
         )
         for window in ("fov_marker", "fov_marker_max", "fov_video", "fov_video_max"):
-            edges = {"left": "0", "top": "0", "right": str(width), "bottom": str(height)}
+            edges = {"left": "0", "top": "0", "right": str(width - 1), "bottom": str(height - 1)}
             ElementTree.SubElement(tag, window, edges)
         axes, center = OPENCV_FROM_QUALISYS @ camera.R, camera.center * MILLIMETRES
         values = {"x": center[0], "y": center[1], "z": center[2]}
         values |= {f"r{i + 1}{j + 1}": axes[i, j] for i in range(3) for j in range(3)}
         ElementTree.SubElement(tag, "transform", _words(values))
         K = camera.K * PARTS_OF_PIXEL
-        k1, k2, p1, p2, k3 = camera.distortion * PARTS_OF_PIXEL
-        lens = {"sensorMinU": 0.0, "sensorMaxU": width * PARTS_OF_PIXEL, "sensorMinV": 0.0}
-        lens |= {"sensorMaxV": height * PARTS_OF_PIXEL, "focalLengthU": K[0, 0], "focalLengthV": K[1, 1]}
+        k1, k2, p1, p2, k3 = camera.distortion
+        lens = {"sensorMinU": 0.0, "sensorMaxU": width * PARTS_OF_PIXEL - 1, "sensorMinV": 0.0}
+        lens |= {"sensorMaxV": height * PARTS_OF_PIXEL - 1, "focalLengthU": K[0, 0], "focalLengthV": K[1, 1]}
         lens |= {"centerPointU": K[0, 2], "centerPointV": K[1, 2], "skew": K[0, 1]}
         lens |= {"radialDistortion1": k1, "radialDistortion2": k2, "radialDistortion3": k3}
         lens |= {"tangentalDistortion1": p1, "tangentalDistortion2": p2}
@@ -131,8 +131,8 @@ def read_qualisys(path: Path) -> dict[str, Camera]:
                     [0, 0, 1],
                 ]
             )
-            size = [window["right"] - window["left"], window["bottom"] - window["top"]]
-            distortion = [parts[key] for key in _DISTORTION_KEYS]
+            size = [window["right"] - window["left"] + 1, window["bottom"] - window["top"] + 1]
+            distortion = [float(lens.get(key, 0.0)) for key in _DISTORTION_KEYS]
             cameras[name] = _camera(
                 K, _rotation_vector(R), -R @ center, distortion, size, f"{path}, camera {name}"
             )
@@ -146,7 +146,7 @@ _DISTORTION_KEYS = (
     "tangentalDistortion2",
     "radialDistortion3",
 )
-_LENS_KEYS = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "skew", *_DISTORTION_KEYS)
+_LENS_KEYS = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "skew")
 
 
 def write_opencv(folder: Path, cameras: Cameras) -> None:

@@ -1,6 +1,7 @@
 """Every format by name: what is written, and what is read."""
 
 import logging
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,14 @@ MOVING = ("colmap", "nerfstudio", "dynamic3dg", "ply", "glb")
 
 
 def _held(event: Event) -> dict[str, Camera]:
-    return {name: event.held(name) for name in event.names}
+    """Held cameras in the order that Pose2Sim has their films in: it knows a camera by its place."""
+    return {name: event.held(name) for name in sorted(event.names, key=last_number_first)}
+
+
+def last_number_first(name: str) -> tuple[bool, int, str]:
+    """Key to sort names by their last number; those without one come last, by their letters."""
+    numbers = re.findall(r"\d+", name)
+    return not numbers, int(numbers[-1]) if numbers else 0, name
 
 
 WRITERS: dict[str, Callable[[Event, Path], None]] = {

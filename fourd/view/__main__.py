@@ -16,7 +16,7 @@ from fourd.view.server import ADDRESS, ViewServer
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Command line. Raises InputError for a scene without a page, OSError for a port that is taken."""
+    """Command line. Raises InputError for a scene without a page, or a port that is taken."""
     parser = argparse.ArgumentParser(prog="python -m fourd.view", description=__doc__)
     parser.add_argument("scene", nargs="?", help="what to show; without it, a page to drop videos on")
     parser.add_argument("--results", type=Path, default=Path("results"))
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 f"`snakemake --cores {args.cores} viewer --config scene={args.scene}` makes it"
             )
         path = f"scenes/{args.scene}/"
-    with ViewServer(args.results, WorkflowJob(Path.cwd(), args.cores), args.port) as server:
+    with open_server(args.results, WorkflowJob(Path.cwd(), args.cores), args.port) as server:
         address = f"http://{ADDRESS}:{server.server_address[1]}/{path}"
         print(f"{address}\nStop with Ctrl-C.", flush=True)
         if not args.no_browser:
@@ -46,6 +46,16 @@ def main(argv: Sequence[str] | None = None) -> None:
                 server.serve_forever()
         finally:
             server.job.cancel()
+
+
+def open_server(results: Path, job: WorkflowJob, port: int) -> ViewServer:
+    """The server, listening. Raises InputError if it may not have the port."""
+    try:
+        return ViewServer(results, job, port)
+    except OSError as error:
+        raise InputError(
+            f"expected port {port} to be free, got: {error.strerror}: stop what has it, or say --port 0"
+        ) from None
 
 
 if __name__ == "__main__":

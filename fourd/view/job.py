@@ -1,6 +1,7 @@
 """Dropped videos, and the workflow that runs on them."""
 
 import contextlib
+import filecmp
 import io
 import os
 import re
@@ -63,6 +64,11 @@ def store_film(folder: Path, index: int, suffix: str, body: io.BufferedIOBase, n
                 )
             file.write(block)
             left -= len(block)
+        file.flush()
+        if path.exists() and filecmp.cmp(path, temporary, shallow=False):
+            # A film that is sent again makes nothing anew: a cancelled run goes on.
+            known = path.stat()
+            os.utime(temporary, ns=(known.st_atime_ns, known.st_mtime_ns))
     return path
 
 

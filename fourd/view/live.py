@@ -29,12 +29,27 @@ from fourd.viewer.lattice import fit_width
 # Backgrounds of so many places are kept: turning back to one is quick.
 MAX_BACKGROUNDS = 24
 MIN_WIDTH, MAX_WIDTH = 64, 1280
+# Of the time of a view: its background, and all before the network.
+BACKGROUND_SHARE, FUSED_SHARE = 0.8, 0.95
 # As the workflow reads it: below the scene's settings stand the defaults, above them this file.
 CONFIG_FILE = Path("config/config.yaml")
 
 
 class Cancelled(Exception):
     """Somebody has asked for another view since."""
+
+
+class BackgroundSteps(Progress):
+    """Tells how far a background is, by its sample frames; a newer wish ends it there."""
+
+    def __init__(self, total: int, tell: Callable[[str, float], None]) -> None:
+        super().__init__("image", total, time.monotonic)
+        self._tell = tell
+
+    def step(self, text: str) -> None:
+        """One more sample is read."""
+        super().step(text)
+        self._tell("background", BACKGROUND_SHARE * self._done / self._total)
 
 
 class LiveScene:
@@ -89,8 +104,8 @@ class LiveScene:
         size = fit_width(self.size, width)
         camera = place_cameras(TrajectorySpec(kind="hold", position=share, num_frames=1), self.scene, size)[0]
         tell("background", 0.0)
-        background = self._background(share, size, camera)
-        tell("foreground", 0.5)
+        background = self._background(share, size, camera, tell)
+        tell("foreground", BACKGROUND_SHARE)
         fused = fuse_view(
             camera,
             self.disparities.at(frame, self.fuse_options.memory_mb),
@@ -101,7 +116,7 @@ class LiveScene:
             depth_range=hull_depth_range(self.scene),
             hull_options=self.hull_options,
         )
-        tell("composition", 0.8)
+        tell("composition", FUSED_SHARE)
         foreground = {f"{name}_rgb": rgb for name, rgb in fused.rgb.items()}
         foreground |= {f"{name}_valid": valid for name, valid in fused.valid.items()}
         image, _ = compose_frame(self.models, frame, foreground, background, self.cascade)
@@ -116,12 +131,14 @@ class LiveScene:
         if not MIN_WIDTH <= width <= MAX_WIDTH:
             raise InputError(f"expected a width from {MIN_WIDTH} to {MAX_WIDTH} px, got {width}")
 
-    def _background(self, share: float, size: tuple[int, int], camera: Any) -> dict[str, np.ndarray]:
+    def _background(
+        self, share: float, size: tuple[int, int], camera: Any, tell: Callable[[str, float], None]
+    ) -> dict[str, np.ndarray]:
         key = (share, size[0])
         if key in self._backgrounds:
             self._backgrounds.move_to_end(key)
             return self._backgrounds[key]
-        progress = Progress("image", len(self.samples.frames), time.monotonic)
+        progress = BackgroundSteps(len(self.samples.frames), tell)
         found = estimate_backgrounds(
             [camera], self.samples, self.fuse_options, self.background_options, progress
         )

@@ -8,7 +8,7 @@ own program is built from `viewer/` at the top of the repository and lies in `as
 
 import dataclasses
 
-STAGE_VERSION = 2
+STAGE_VERSION = 3
 
 
 @dataclasses.dataclass(frozen=True)

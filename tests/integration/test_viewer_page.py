@@ -140,6 +140,22 @@ def test_keyboard_alone_moves_everything(page) -> None:
     page.wait_for_function("document.getElementById('speed').value === '0.1'")
 
 
+def test_keys_work_before_anything_has_the_focus(page) -> None:
+    assert page.evaluate("document.activeElement === document.body")
+    page.keyboard.press("Shift+ArrowRight")
+    page.wait_for_function("document.getElementById('view').value === '0.6'")
+    # This one scrolls the page, unless the picture has the focus.
+    page.keyboard.press("ArrowUp")
+    page.focus("#view")
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Shift+ArrowLeft")
+    page.wait_for_function("document.getElementById('view').value === '0.48'")
+    assert page.input_value("#time") == "0"
+    page.focus("#speed")
+    page.keyboard.press("l")
+    assert page.is_checked("#loop")
+
+
 def test_drag_and_wheel_move_view_and_time(page) -> None:
     box = page.locator("#stage").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -181,8 +197,20 @@ def test_real_picture_stands_beside_the_render(page) -> None:
     assert psnr_db(shown(page, "real"), truth) > 30
     set_slider(page, "cut", 20)
     page.wait_for_function("document.getElementById('stage').style.getPropertyValue('--cut') === '20%'")
+    box = page.locator("#stage").bounding_box()
+    line = page.locator("#cutline").bounding_box()
+    assert line["x"] + line["width"] / 2 == pytest.approx(box["x"] + 0.2 * box["width"], abs=1)
+    page.mouse.move(line["x"] + line["width"] / 2, box["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 60, steps=4)
+    page.mouse.up()
+    assert (page.input_value("#cut"), page.input_value("#view")) == ("70", "0.5")
+    assert page.locator("#cameras button[aria-current='true']").inner_text() == "cam01"
     page.click("#cameras button:has-text('cam02')")
     page.wait_for_function("document.getElementById('real').dataset.camera === 'cam02'")
+    page.wait_for_function(
+        "document.querySelector(\"#cameras button[aria-current='true']\").textContent === 'cam02'"
+    )
 
 
 def test_saved_path_is_a_film_of_the_workflow(page, tmp_path: Path) -> None:

@@ -109,6 +109,26 @@ def test_convention_qualisys_is_turned_half_around_x_in_millimetres(tmp_path: Pa
         u = (float(lens.get("centerPointU")) + float(lens.get("focalLengthU")) * right / -back) / 64
         v = (float(lens.get("centerPointV")) - float(lens.get("focalLengthV")) * up / -back) / 64
         np.testing.assert_allclose(np.stack([u, v], axis=-1), camera.project(POINTS)[0], atol=1e-9)
+        assert (tag.find("fov_video").get("right"), tag.find("fov_video").get("bottom")) == ("1279", "719")
+
+
+def test_qualisys_lenses_are_not_in_parts_of_pixels(tmp_path: Path) -> None:
+    """Numbers of the kind that Qualisys writes for a camera of 1920 x 1088 px behind a mild barrel lens."""
+    text = (
+        '<calibration><cameras><camera serial="26580">'
+        '<fov_video left="0" top="0" right="1919" bottom="1087"/>'
+        '<transform x="0" y="0" z="3000" r11="1" r12="0" r13="0" r21="0" r22="1" r23="0" r31="0" r32="0" '
+        'r33="1"/><intrinsic focalLengthU="107872" focalLengthV="107880" centerPointU="60827" '
+        'centerPointV="32684" skew="0" radialDistortion1="-0.0455" radialDistortion2="0.1396" '
+        'radialDistortion3="0" tangentalDistortion1="0.0006" tangentalDistortion2="-0.0004"/>'
+        "</camera></cameras></calibration>"
+    )
+    (tmp_path / "a.qca.txt").write_text(text)
+    camera = READERS["qualisys"](tmp_path / "a.qca.txt")["26580"]
+    assert camera.size == (1920, 1088)
+    np.testing.assert_allclose(camera.distortion, [-0.0455, 0.1396, 0.0006, -0.0004, 0])
+    np.testing.assert_allclose(camera.focal_px, 107872 / 64, rtol=1e-3)
+    np.testing.assert_allclose(camera.center, [0, 0, 3], atol=1e-12)
 
 
 def test_easymocap_is_read_by_opencv_and_sizes_may_be_missing(tmp_path: Path) -> None:

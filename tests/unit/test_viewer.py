@@ -71,6 +71,20 @@ def test_views_go_before_moments_and_size_before_those() -> None:
     assert len(fixed.views) == 40
 
 
+@pytest.mark.parametrize("num_frames", [900, 9000])
+@pytest.mark.parametrize(("max_mb", "width", "num_moments"), [(20, 320, 72), (100, 640, 91), (200, 640, 182)])
+def test_a_long_clip_costs_no_more_than_it_may(
+    num_frames: int, max_mb: float, width: int, num_moments: int
+) -> None:
+    """Fifteen cameras: however long the clip is, views go down to two for three cameras, then sizes."""
+    lattice = choose_lattice((1920, 1080), num_frames, 15, 15, ViewerOptions(max_mb=max_mb))
+    assert (len(lattice.views), lattice.size[0], len(lattice.frames)) == (10, width, num_moments)
+    assert 0.97 * max_mb < lattice.forecast_mb <= max_mb
+    # Evenly through the whole clip.
+    gaps = np.diff(lattice.frames)
+    assert gaps.max() - gaps.min() <= 1 and lattice.frames[-1] >= num_frames - gaps.max()
+
+
 def test_too_few_bytes_are_refused_with_what_would_do() -> None:
     with pytest.raises(InputError, match=r"set max_mb to (\d+) or more") as refusal:
         choose_lattice((1920, 1080), 900, 30, 30, ViewerOptions(max_mb=1))

@@ -3,6 +3,7 @@
 import http.client
 import io
 import json
+import os
 import socket
 import threading
 import time
@@ -15,7 +16,7 @@ import pytest
 from fourd.errors import InputError
 from fourd.view.__main__ import main
 from fourd.view.job import MAX_FILM_BYTES, MAX_FILMS, WorkflowJob, check_scene_name, store_film
-from fourd.view.live import Cancelled, LiveQueue
+from fourd.view.live import BackgroundSteps, Cancelled, LiveQueue
 from fourd.view.server import ViewServer
 from tests.conftest import REPOSITORY, Workspace
 from tests.unit.film_files import constant_ticks, write_video
@@ -119,6 +120,18 @@ def test_films_of_wrong_size_leave_nothing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="6 are missing: send it again"):
         store_film(tmp_path, 0, "mp4", io.BufferedReader(io.BytesIO(b"film")), 10)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_sent_again_makes_nothing_anew(tmp_path: Path) -> None:
+    def send(film: bytes) -> os.stat_result:
+        path = store_film(tmp_path, 0, "mp4", io.BufferedReader(io.BytesIO(film)), len(film))
+        assert path.read_bytes() == film
+        return path.stat()
+
+    send(b"film")
+    os.utime(tmp_path / "cam00.mp4", ns=(10**18, 10**18))
+    assert send(b"film").st_mtime_ns == 10**18
+    assert send(b"Film").st_mtime_ns > 10**18
 
 
 def test_scene_names_are_words() -> None:
@@ -230,7 +243,8 @@ def test_newest_wish_wins() -> None:
         thread.join(10)
     assert rendered == [0.3]
     assert isinstance(results[0.1], Cancelled) and isinstance(results[0.2], Cancelled)
-    assert isinstance(results[0.3], bytes) and results[0.3].startswith(b"\x89PNG")
+    picture = results[0.3]
+    assert isinstance(picture, bytes) and picture.startswith(b"\x89PNG")
     assert queue.state["step"] == "idle"
 
 
@@ -246,3 +260,23 @@ def test_faults_of_live_views_are_sentences(server: ViewServer) -> None:
 def test_scene_without_a_page_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"viewer --config scene=event` makes it"):
         main(["event", "--results", str(tmp_path), "--no-browser"])
+
+
+def test_a_port_that_is_taken_is_named(server: ViewServer, tmp_path: Path) -> None:
+    taken = str(server.server_address[1])
+    with pytest.raises(InputError, match=f"expected port {taken} to be free"):
+        main(["--results", str(tmp_path), "--port", taken, "--no-browser"])
+
+
+def test_a_background_is_stopped_by_a_newer_wish() -> None:
+    def tell(step: str, share: float) -> None:
+        told.append(share)
+        if len(told) == 2:
+            raise Cancelled
+
+    told: list[float] = []
+    steps = BackgroundSteps(4, tell)
+    steps.step("sample 0")
+    with pytest.raises(Cancelled):
+        steps.step("sample 5")
+    assert told == pytest.approx([0.2, 0.4])

@@ -4,9 +4,10 @@ import type { App } from "./app";
 import { centerOf, dot, length, subtract } from "./geometry";
 import { formatLink, readLink } from "./link";
 import { legendOf } from "./overlay";
+import { applyKey } from "./input";
 import { element, make } from "./page";
 import { isOutside } from "./path";
-import { type Overlay, SPEEDS, type State, orbit, seek, stepMoment, togglePlay } from "./state";
+import { type Overlay, SPEEDS, type State, clamp, orbit, seek, stepMoment, togglePlay } from "./state";
 
 // The address bar is written at most this often; browsers stop pages that write it on every frame.
 const LINK_INTERVAL_MS = 400;
@@ -28,6 +29,13 @@ export function connectControls(app: App): void {
     change((s) => seek({ ...s, isPlaying: false }, Number(time.value), numMoments)),
   );
   view.addEventListener("input", () => change((s) => orbit(s, Number(view.value))));
+  // Its own steps are as fine as the drag needs, a thousand from end to end.
+  view.addEventListener("keydown", (event) => {
+    const key = { ArrowUp: "ArrowRight", ArrowDown: "ArrowLeft" }[event.key] ?? event.key;
+    if (key !== "ArrowLeft" && key !== "ArrowRight") return;
+    event.preventDefault();
+    change((s) => applyKey(key, event.shiftKey, s, numMoments)!);
+  });
   play.addEventListener("click", () => change((s) => togglePlay(s, numMoments)));
   element("back").addEventListener("click", () => change((s) => stepMoment(s, -1, numMoments)));
   element("forward").addEventListener("click", () => change((s) => stepMoment(s, 1, numMoments)));
@@ -44,7 +52,6 @@ export function connectControls(app: App): void {
     loop.checked = state.isLooping;
     shown.value = state.overlay;
     play.textContent = state.isPlaying ? "Pause" : "Play";
-    play.setAttribute("aria-pressed", String(state.isPlaying));
     const frame = `frame ${app.frame + 1} of ${manifest.num_frames}`;
     const seconds = `${(app.frame / manifest.fps).toFixed(2)} s`;
     element("time-text").textContent = `${seconds}, ${frame.replace("frame ", "").replace(" of ", "/")}`;
@@ -61,17 +68,17 @@ export function connectControls(app: App): void {
 /** Where the view stands, in words: at a camera, or between two. */
 export function describePlace(app: App): string {
   const center = centerOf(app.pose);
-  const right = app.pose.R.slice(0, 3);
+  const toRight = app.pose.R.slice(0, 3);
   const cameras = app.manifest.cameras.map((camera) => {
     const offset = subtract(centerOf(camera.poses[Math.min(app.moment, camera.poses.length - 1)]!), center);
-    return { name: camera.name, distance: length(offset), side: dot(offset, right) };
+    return { name: camera.name, distance: length(offset), side: dot(offset, toRight) };
   });
   cameras.sort((a, b) => a.distance - b.distance);
   const nearest = cameras[0]!;
   const other = cameras.find((camera) => camera.side * nearest.side < 0);
-  return other && nearest.distance > 0.15 * other.distance
-    ? `${nearest.name} – ${other.name}`
-    : `at ${nearest.name}`;
+  if (!other || nearest.distance <= 0.15 * other.distance) return `at ${nearest.name}`;
+  const [left, right] = nearest.side < 0 ? [nearest, other] : [other, nearest];
+  return `${left.name} – ${right.name}`;
 }
 
 function connectCompare(app: App): void {
@@ -89,10 +96,29 @@ function connectCompare(app: App): void {
   };
   compare.addEventListener("change", update);
   cut.addEventListener("input", update);
+  connectDivider(element("cutline"), stage, (share) => {
+    cut.value = String(Math.round(100 * share));
+    update();
+  });
   app.onState(() => {
     element("realname").textContent = `${app.manifest.cameras[app.camera]!.name}, as filmed`;
   });
   update();
+}
+
+/** The line between render and real picture is dragged like a slider. */
+function connectDivider(divider: HTMLElement, stage: HTMLElement, move: (share: number) => void): void {
+  divider.addEventListener("pointerdown", (event) => {
+    // The stage below would take it for a move of the view.
+    event.stopPropagation();
+    divider.setPointerCapture(event.pointerId);
+  });
+  divider.addEventListener("pointermove", (event) => {
+    if (!divider.hasPointerCapture(event.pointerId)) return;
+    event.stopPropagation();
+    const { left, width } = stage.getBoundingClientRect();
+    move(clamp((event.clientX - left) / width, 0, 1));
+  });
 }
 
 function connectLink(app: App): void {
@@ -144,12 +170,16 @@ function showProgress(app: App): void {
   app.store.onError = (file) => failed.push(file);
   app.onState(() => {
     const share = app.store.progress;
-    const done = `${app.numMoments} moments from ${app.manifest.views.length} places`;
+    const { num_frames, views } = app.manifest;
+    const clip = app.numMoments < num_frames ? ` of a clip of ${num_frames} frames` : "";
+    const done = `${app.numMoments} moments from ${views.length} places${clip}`;
     const text = failed.length
       ? `${failed.length} files of this page are missing, first data/${failed[0]!}: copy the whole folder`
       : share < 1
         ? `loading, ${Math.floor(100 * share)} %`
         : done;
+    // A screen reader says what it comes to, not every per cent of the way.
+    status.setAttribute("aria-busy", String(share < 1 && !failed.length));
     if (status.textContent !== text) status.textContent = text;
   });
 }

@@ -5,6 +5,7 @@ import { type State, changeSpeed, orbit, seek, stepMoment, togglePlay } from "./
 /** Share of the path passed by a drag over the stage's whole width. */
 const SHARE_PER_WIDTH = 0.9;
 const SHARE_PER_STEP = 0.02;
+const SCROLLING = new Set(["ArrowUp", "ArrowDown", "Home", "End"]);
 const WHEEL_SHARE = 0.0004;
 const WHEEL_MOMENTS = 0.03;
 
@@ -97,8 +98,10 @@ export function listen(stage: HTMLElement, change: Change, numMoments: number): 
     },
     { passive: false },
   );
-  stage.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
+  document.addEventListener("keydown", (event) => {
+    // Other controls have keys of their own; where nothing has the focus, the page is scrolled by these.
+    const isOurs = event.target === stage || (event.target === document.body && !SCROLLING.has(event.key));
+    if (!isOurs || event.ctrlKey || event.metaKey || event.altKey) return;
     change((state) => {
       const next = applyKey(event.key, event.shiftKey, state, numMoments);
       if (next) event.preventDefault();

@@ -13,6 +13,7 @@ import {
   subtract,
 } from "./geometry";
 import { type Manifest, type Pose, poseAt } from "./manifest";
+import { clamp } from "./state";
 
 export interface MapView {
   azimuth: number;
@@ -77,6 +78,7 @@ export interface MapColours {
   camera: string;
   heldout: string;
   shown: string;
+  card: string;
 }
 
 export function drawMap(
@@ -114,16 +116,43 @@ export function drawMap(
     context.lineWidth = (i === nearest ? 2.4 : 1.1) * unit;
     drawFrustum(context, project, pose, camera.size, basis.extent * 0.22);
     const [x, y] = project(centerOf(pose));
-    context.fillStyle = colours.ink;
-    context.font = `${11 * unit}px system-ui, sans-serif`;
-    context.textAlign = x > 0.8 * width ? "right" : "left";
-    context.fillText(camera.name, x + (x > 0.8 * width ? -5 : 5) * unit, y - 5 * unit);
     return [x, y];
   });
   context.strokeStyle = colours.shown;
   context.lineWidth = 2.6 * unit;
   drawFrustum(context, project, shown, manifest.size, basis.extent * 0.34);
+  const names = manifest.cameras.map((camera) => camera.name);
+  drawNames(context, names, places, nearest, colours, unit);
   return places;
+}
+
+/** Names of the cameras below their places, the nearest one's first; one that would cover another is left out. */
+function drawNames(
+  context: CanvasRenderingContext2D,
+  names: string[],
+  places: [number, number][],
+  nearest: number,
+  colours: MapColours,
+  unit: number,
+): void {
+  context.font = `${11 * unit}px system-ui, sans-serif`;
+  context.textAlign = "center";
+  context.lineJoin = "round";
+  context.lineWidth = 3 * unit;
+  context.strokeStyle = colours.card;
+  context.fillStyle = colours.ink;
+  const taken: [number, number, number][] = [];
+  for (const i of new Set([nearest, ...names.keys()])) {
+    const half = context.measureText(names[i]!).width / 2 + 2 * unit;
+    const x = clamp(places[i]![0], half, context.canvas.width - half);
+    for (const y of [places[i]![1] + 14 * unit, places[i]![1] - 20 * unit]) {
+      if (taken.some(([u, v, w]) => Math.abs(u - x) < w + half && Math.abs(v - y) < 12 * unit)) continue;
+      taken.push([x, y, half]);
+      context.strokeText(names[i]!, x, y);
+      context.fillText(names[i]!, x, y);
+      break;
+    }
+  }
 }
 
 function strokeLine(context: CanvasRenderingContext2D, points: [number, number, number][]): void {

@@ -25,6 +25,7 @@ export function connectMap(app: App): void {
       camera: colour("camera"),
       heldout: colour("heldout"),
       shown: colour("shown"),
+      card: colour("card"),
     };
     places = drawMap(context, app.manifest, view, app.pose, app.moment, app.camera, colours);
   };
@@ -49,16 +50,22 @@ export function connectMap(app: App): void {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   canvas.closest("details")!.addEventListener("toggle", draw);
   app.onState(draw);
-  element("cameras").append(
-    ...app.manifest.cameras.map((camera, i) => {
-      const button = make("button", {
-        type: "button",
-        textContent: camera.name,
-        className: camera.is_heldout ? "heldout" : "",
-      });
-      if (camera.is_heldout) button.title = "held out: nothing is made from it";
-      button.addEventListener("click", () => goToCamera(app, i));
-      return button;
+  element("heldout-hint").hidden = !app.manifest.cameras.some((camera) => camera.is_heldout);
+  const chips = app.manifest.cameras.map((camera, i) => {
+    const button = make("button", {
+      type: "button",
+      textContent: camera.name,
+      className: camera.is_heldout ? "heldout" : "",
+    });
+    if (camera.is_heldout) button.title = "held out: nothing is made from it";
+    button.addEventListener("click", () => goToCamera(app, i));
+    return button;
+  });
+  element("cameras").append(...chips);
+  app.onState(() =>
+    chips.forEach((chip, i) => {
+      const isNearest = String(i === app.camera);
+      if (chip.getAttribute("aria-current") !== isNearest) chip.setAttribute("aria-current", isNearest);
     }),
   );
 }
@@ -129,7 +136,6 @@ export function connectPath(app: App): void {
   };
   const showPlayed = (): void => {
     preview.textContent = played === null ? "Preview" : "Stop";
-    preview.setAttribute("aria-pressed", String(played !== null));
   };
   element("add-key").addEventListener("click", () =>
     update({ ...path, keys: [...path.keys, { frame: app.frame, share: app.state.share, seconds: 2 }] }),
@@ -160,7 +166,7 @@ function drawKey(app: App, path: Path, at: number, update: (path: Path) => void)
   const change = (keys: Path["keys"]): void => update({ ...path, keys });
   const moment = momentOfFrame(app.manifest.frames, key.frame);
   const outside = isOutside(app.manifest, key.share, moment) ? ", outside the cameras" : "";
-  const words = `frame ${key.frame + 1}, view ${Math.round(100 * key.share)} %${outside}`;
+  const words = `frame ${key.frame + 1}, ${Math.round(100 * key.share)} %${outside}`;
   const button = (text: string, label: string, action: () => void): HTMLButtonElement => {
     const made = make("button", {
       type: "button",
@@ -170,7 +176,7 @@ function drawKey(app: App, path: Path, at: number, update: (path: Path) => void)
     made.addEventListener("click", action);
     return made;
   };
-  const row = make("div", {}, words);
+  const row = make("div", {}, make("span", {}, words));
   if (at > 0) {
     const seconds = make("input", {
       type: "number",
@@ -184,7 +190,7 @@ function drawKey(app: App, path: Path, at: number, update: (path: Path) => void)
       const value = clamp(Number(seconds.value) || key.seconds, 0.1, 60);
       change(path.keys.map((other, i) => (i === at ? { ...other, seconds: value } : other)));
     });
-    row.append(" after ", seconds, " s");
+    row.append(make("label", {}, "after ", seconds, " s"));
   }
   row.append(
     button("Go", "Go to", () =>

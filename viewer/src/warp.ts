@@ -186,7 +186,8 @@ export function meshIndices(width: number, height: number, stride: number): Uint
 
 function makeTarget(gl: WebGL2RenderingContext, full: [number, number], by: number): Target {
   const size: [number, number] = [Math.ceil(full[0] / by), Math.ceil(full[1] / by)];
-  const texture = makeTexture(gl, gl.LINEAR);
+  // At full size a pixel is read where it was drawn; its neighbours may be black, as nothing was drawn there.
+  const texture = makeTexture(gl, by === 1 ? gl.NEAREST : gl.LINEAR);
   gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA8, ...size);
   const depth = gl.createRenderbuffer();
   gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
