@@ -6,6 +6,7 @@ min_version("9.27")
 configfile: "config/config.yaml"
 
 
+include: "rules/engine.smk"
 include: "rules/common.smk"
 include: "rules/demo.smk"
 include: "rules/ingest.smk"
@@ -40,6 +41,7 @@ rule render_all:
 onstart:
     check_folders()
     check_budget(rule.name for rule in workflow.dag.targetrules)
+    calm_engine()
 
 
 onsuccess:

@@ -124,19 +124,23 @@ def measure(part: str, folder: Path, cores: int, path: str | None = None) -> dic
     }
 
 
+def write_stub(folder: Path) -> None:
+    """A `python` that makes the outputs of any job and does nothing else, and what it copies."""
+    folder.mkdir(parents=True)
+    stub = folder / "python"
+    stub.write_text(STUB)
+    stub.chmod(0o755)
+    with ArchiveWriter(folder / "empty.npz", {"status": "ok"}):
+        pass
+    # What the engine itself reads: cameras, and what is known of the pairs.
+    write_json(folder / "empty.json", {"left_out": {}, "pairs": {}, "silhouettes": "ok", "motion": {}})
+
+
 def measure_empty_jobs(folder: Path, cores: int) -> list[dict[str, object]]:
     """About 2,000 jobs that do nothing, then the same command once more."""
     scene = large_scene(num_cameras=15, num_frames=900, chunk_frames=50)
     write_scene(folder, "large", scene)
-    (folder / "bin").mkdir()
-    stub = folder / "bin" / "python"
-    stub.write_text(STUB)
-    stub.chmod(0o755)
-    with ArchiveWriter(folder / "bin" / "empty.npz", {"status": "ok"}):
-        pass
-    # What the engine itself reads: cameras, and what is known of the pairs.
-    known = {"left_out": {}, "pairs": {}, "silhouettes": "ok", "motion": {}}
-    write_json(folder / "bin" / "empty.json", known)
+    write_stub(folder / "bin")
     path = str(folder / "bin")
     return [measure(part, folder, cores, path) for part in ("soak", "nothing_to_do")]
 

@@ -1,7 +1,6 @@
 """Checked configuration, the lists that span the job graph, and helper functions of the rules."""
 
 import functools
-import gc
 import json
 import os
 import sys
@@ -22,9 +21,6 @@ from fourd.plan.outline import describe_scene
 from fourd.plan.work import OK, choose_work
 from fourd.sources import check_sources, source_stamp
 from fourd.trajectory import resolve_trajectories
-
-# A job graph is many objects that live to the end: looking for garbage among them took a sixth of a dry run.
-gc.set_threshold(100_000, 10, 10)
 
 MADE_BY_RULES = ("data/demo/", "data/pose2sim/")
 
@@ -211,10 +207,16 @@ def films_of_pair(wildcards):
     }
 
 
+@functools.cache
+def words(numbers):
+    """One word for the engine, which formats lists number by number, three times for every job."""
+    return " ".join(map(str, numbers))
+
+
 def disparity_frames(wildcards):
     if wildcards.chunk == "samples":
-        return SAMPLE_FRAMES
-    return list(fourd_config.frames_of_chunk(wildcards.chunk))
+        return words(SAMPLE_FRAMES)
+    return words(fourd_config.frames_of_chunk(wildcards.chunk))
 
 
 def disparities_at(view, chunks):
@@ -356,10 +358,6 @@ def check_folders():
 
 def print_finished():
     """Where to look, and what was left out, when everything is done."""
-    # Imported here: it loads OpenCV, which a dry run does not need.
-    from fourd.io import read_json
-    from fourd.stereo.files import refused_pairs
-
     folder = Path(RESULTS)
     films = [p for p in (folder / "render" / f"{name}.mp4" for name in TRAJECTORIES) if p.is_file()]
     if films:
@@ -367,13 +365,15 @@ def print_finished():
     if (folder / "viewer" / "index.html").is_file():
         print(f"\nTo browse: {folder / 'viewer' / 'index.html'}")
     cameras = folder / "sfm" / "cameras.json"
-    left_out = read_json(cameras)["left_out"] if cameras.is_file() else {}
+    left_out = json.loads(cameras.read_text())["left_out"] if cameras.is_file() else {}
     if left_out:
         print(f"\n{len(left_out)} of {len(SCENE.cameras)} cameras were left out:")
         print(*(f"  {cam}: {reason}" for cam, reason in left_out.items()), sep="\n")
-    refused = refused_pairs([folder / "rectification" / f"{pair}.npz" for pair in SCENE.pairs])
+    survey = folder / "plan" / "survey.json"
+    facts = read_survey(survey).pairs if survey.is_file() else {}
     # A camera that was left out has been named already.
-    refused = {p: r for p, r in refused.items() if not left_out.keys() & set(p.split("-"))}
+    known = {p: fact.status for p, fact in facts.items() if not left_out.keys() & set(p.split("-"))}
+    refused = {pair: status for pair, status in known.items() if status != OK}
     if refused:
         print(f"\n{len(refused)} of {len(SCENE.pairs)} pairs of cameras were left out:")
         print(*(f"  {pair}: {reason}" for pair, reason in refused.items()), sep="\n")

@@ -6,21 +6,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.plan.cost import Machine, read_machine
 from fourd.plan.work import PairFacts, Survey
 
 
 def read_pair_facts(paths: Sequence[Path]) -> dict[str, PairFacts]:
     """LEFT-RIGHT -> facts, of rectification files. Raises InputError for another file."""
-    # Imported here: the job graph reads work.json through this module and needs no OpenCV.
-    from fourd.io import Archive
+    # Imported here: the job graph reads survey.json through this module and needs no OpenCV.
+    from fourd.stereo.pairs import read_pair_meta
 
     facts = {}
     for path in paths:
-        archive = Archive(path)
-        meta = archive.meta
-        try:
+        meta = read_pair_meta(path)
+        with explain_faults(f"a rectification of this workflow at {path}"):
             ranges = meta["guard"]
             low, high = ranges.get("disparity_low", [None])[0], ranges.get("disparity_high", [None])[-1]
             facts[f"{meta['left']}-{meta['right']}"] = PairFacts(
@@ -30,13 +29,6 @@ def read_pair_facts(paths: Sequence[Path]) -> dict[str, PairFacts]:
                 size=(int(meta["size"][0]), int(meta["size"][1])),
                 num_disparities=None if low is None or high is None else float(high) - float(low),
             )
-        except (KeyError, TypeError) as error:
-            raise InputError(
-                f"expected a rectification of this workflow at {path}, its meta lacks {error}: delete it and "
-                "run again"
-            ) from None
-        finally:
-            archive.close()
     return facts
 
 
@@ -46,18 +38,9 @@ def read_motion(paths: Sequence[Path], inputs: Sequence[str]) -> dict[str, str]:
 
     statuses = {}
     for path in paths:
-        archive = Archive(path)
-        try:
-            name, status = str(archive.meta["name"]), str(archive.meta["status"])
-        except KeyError as error:
-            raise InputError(
-                f"expected motion maps at {path}, their meta lacks {error}: delete the file and run again"
-            ) from None
-        finally:
-            archive.close()
-        if name in inputs:
-            statuses[name] = status
-    return statuses
+        with Archive(path) as archive, explain_faults(f"motion maps at {path}"):
+            statuses[str(archive.meta["name"])] = str(archive.meta["status"])
+    return {name: status for name, status in statuses.items() if name in inputs}
 
 
 def survey_to_dict(survey: Survey) -> dict[str, Any]:

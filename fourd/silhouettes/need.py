@@ -4,25 +4,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from fourd.errors import InputError
-from fourd.io import Archive
 from fourd.silhouettes.options import USES, SilhouetteOptions
+from fourd.stereo.pairs import read_pair_meta
 
 
 def read_pair_statuses(paths: Sequence[Path]) -> dict[tuple[str, str], str]:
     """(left, right) -> status, of rectification files. Raises InputError for another file."""
-    statuses = {}
-    for path in paths:
-        archive = Archive(path)
-        try:
-            statuses[archive.meta["left"], archive.meta["right"]] = str(archive.meta["status"])
-        except KeyError as error:
-            raise InputError(
-                f"expected a rectification of this workflow at {path}, its meta lacks {error}: delete it and "
-                "run again"
-            ) from None
-        finally:
-            archive.close()
-    return statuses
+    metas = map(read_pair_meta, paths)
+    return {(meta["left"], meta["right"]): meta["status"] for meta in metas}
 
 
 def reason_against(

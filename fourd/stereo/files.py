@@ -1,12 +1,11 @@
 """Files of stage stereo (docs/formats.md): rectification of a pair, disparity of a pair and chunk."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.io import Archive, ArchiveWriter
 from fourd.stereo.disparity import PairDisparity
 from fourd.stereo.rectify import STATUS_OK, PairRectification, Rectification
@@ -38,9 +37,8 @@ def write_rectification(path: Path | str, pair: PairRectification) -> None:
 
 def read_rectification(path: Path | str) -> PairRectification:
     """Inverse of `write_rectification`. Raises InputError if the file is not one."""
-    archive = Archive(path)
-    meta = archive.meta
-    try:
+    with Archive(path) as archive, explain_faults(f"a rectification of this workflow at {path}"):
+        meta = archive.meta
         (width, height), (width_right, height_right) = meta["size"], meta["size_right"]
         frames = tuple(
             Rectification.from_arrays(
@@ -49,17 +47,9 @@ def read_rectification(path: Path | str) -> PairRectification:
             for frame in archive.frames()
         )
         measures = {name: (_from_json(low), _from_json(high)) for name, (low, high) in meta["guard"].items()}
-        pair = PairRectification(
+        return PairRectification(
             meta["left"], meta["right"], meta["status"], meta["frames"], frames, measures
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"expected a rectification of this workflow at {path}, got an archive that lacks {error}; "
-            "delete the file and run again"
-        ) from None
-    finally:
-        archive.close()
-    return pair
 
 
 def _from_json(value: float | None) -> float:
@@ -145,14 +135,3 @@ def encode_confidence(confidence: np.ndarray) -> np.ndarray:
 def decode_confidence(levels: np.ndarray) -> np.ndarray:
     """Inverse of `encode_confidence`: (H, W) float32."""
     return levels / np.float32(255)
-
-
-def refused_pairs(paths: Sequence[Path]) -> dict[str, str]:
-    """Pair -> why it is not matched, of rectification files; usable pairs and absent files are left out."""
-    refused = {}
-    for path in paths:
-        if path.is_file():
-            status = Archive(path).meta["status"]
-            if status != "ok":
-                refused[path.stem] = status
-    return refused

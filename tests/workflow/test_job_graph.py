@@ -1,11 +1,13 @@
 """What the dry run shows: how many jobs of each rule, and what a changed setting runs again."""
 
+import os
 import re
 import resource
 import subprocess
 
 import pytest
 
+from benches.load import write_stub
 from tests.conftest import Workspace, tiny_scene
 
 DRY_RUN = ("render_all", "-n", "--quiet", "rules", "host")
@@ -76,6 +78,20 @@ def test_too_many_jobs_are_refused_with_a_chunk_size_that_fits(workspace: Worksp
     assert proposed, result.stdout
     workspace.write_config({"scene": "large", "chunk_frames": int(proposed[1]), "max_jobs": 2000})
     assert workspace.snakemake(*DRY_RUN).returncode == 0
+
+
+def test_the_engine_looks_for_work_when_a_job_ends_and_not_more_often(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its timers, each of which started one more, took ten times as much as its own work for the jobs."""
+    workspace.write_scene("demo", tiny_scene(num_cameras=6))
+    write_stub(workspace.folder / "bin")
+    monkeypatch.setenv("PATH", f"{workspace.folder / 'bin'}:{os.environ['PATH']}")
+    result = workspace.snakemake("--cores", "1", "--verbose", "render_all")
+    assert result.returncode == 0, result.stdout
+    jobs, rounds = result.stdout.count("Finished jobid"), result.stdout.count("Ready jobs: ")
+    assert jobs > 80
+    assert rounds <= jobs + 2
 
 
 @pytest.mark.parametrize("arguments", [("--lint",), ("render_all", "--rulegraph")])
