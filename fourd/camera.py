@@ -5,13 +5,14 @@ top-left pixel is (0, 0), sizes are (width, height). All poses are float64.
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any
 
 import cv2
 import numpy as np
 
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 
 NUM_DISTORTION = 5
 # Corners of real calibrations fold back by up to half a percent of the picture.
@@ -144,10 +145,11 @@ def check_camera(camera: Camera, where: str) -> None:
     """Raise InputError, naming `where`, unless the camera can be used for geometry."""
     if not all(np.isfinite(a).all() for a in (camera.K, camera.R, camera.t, camera.distortion)):
         raise InputError(f"{where}: K, R, t must be finite numbers, got NaN or infinity: fix the calibration")
-    if camera.K[0, 0] <= 0 or camera.K[1, 1] <= 0 or not np.allclose(camera.K[2], [0, 0, 1]):
+    is_upper = abs(camera.K[1, 0]) <= 1e-6 * camera.K[1, 1] and np.allclose(camera.K[2], [0, 0, 1])
+    if camera.K[0, 0] <= 0 or camera.K[1, 1] <= 0 or not is_upper:
         raise InputError(
-            f"{where}: K must have positive focal lengths and last row 0 0 1, got {camera.K.tolist()}: "
-            "fix the calibration"
+            f"{where}: K must have positive focal lengths, zeros below them and last row 0 0 1, got "
+            f"{camera.K.tolist()}: fix the calibration"
         )
     folded = folded_share(camera)
     if folded > MAX_FOLDED_SHARE:
@@ -171,6 +173,13 @@ def folded_share(camera: Camera) -> float:
     """
     if not camera.is_distorted:
         return 0.0
+    return _folded_share(camera.size, tuple(camera.K.ravel()), tuple(camera.distortion))
+
+
+@functools.lru_cache(maxsize=256)
+def _folded_share(size: tuple[int, int], K: tuple[float, ...], distortion: tuple[float, ...]) -> float:
+    """Kept, because a camera that moves has one lens and thousands of poses."""
+    camera = Camera(np.reshape(K, (3, 3)), np.eye(3), np.zeros(3), size, np.array(distortion))
     pixels = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 33) for n in camera.size)), axis=-1)
     miss_px = np.abs(camera.pixels_from_normalized(camera.rays(pixels)[..., :2]) - pixels).max(axis=-1)
     return float((~(miss_px < 1)).mean())
@@ -223,15 +232,18 @@ def tracks_to_dict(tracks: Mapping[str, CameraTrack]) -> dict[str, Any]:
 
 def tracks_from_dict(document: Mapping[str, Any], where: str) -> dict[str, CameraTrack]:
     """Inverse of `tracks_to_dict`; every camera is checked. Raises InputError."""
-    tracks = {}
-    for name, entry in document.items():
-        size = tuple(entry["size"])
-        cameras = tuple(
-            camera_from_dict(frame, size, f"{where}, camera {name}, frame {i}")
-            for i, frame in enumerate(entry["frames"])
-        )
-        far = entry.get("far")
-        tracks[name] = CameraTrack(
-            name, cameras, entry.get("near") or 0.0, float("inf") if far is None else far
-        )
-    return tracks
+    with explain_faults(f"cameras by name in {where}"):
+        return {name: _track_from_dict(name, entry, where) for name, entry in document.items()}
+
+
+def _track_from_dict(name: str, entry: Mapping[str, Any], where: str) -> CameraTrack:
+    size = (int(entry["size"][0]), int(entry["size"][1]))
+    near = float(entry.get("near") or 0.0)
+    far = float("inf") if entry.get("far") is None else float(entry["far"])
+    if min(size) < 1 or not entry["frames"] or not 0 <= near < far:
+        raise ValueError(f"{name}: size {size}, {len(entry['frames'])} frames, near {near}, far {far}")
+    cameras = tuple(
+        camera_from_dict(frame, size, f"{where}, camera {name}, frame {i}")
+        for i, frame in enumerate(entry["frames"])
+    )
+    return CameraTrack(name, cameras, near, far)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fourd.camera import Camera, camera_from_dict
-from fourd.errors import InputError
+from fourd.errors import explain_faults
 from fourd.io import SCHEMA_VERSION, read_json, write_json
 
 
@@ -81,7 +81,7 @@ def write_film_cameras(path: Path | str, films: FilmCameras) -> None:
 def read_film_cameras(path: Path | str) -> FilmCameras:
     """Inverse of `write_film_cameras`; every camera is checked. Raises InputError, naming the file."""
     document = read_json(path)
-    try:
+    with explain_faults(f"film_cameras.json of the stage sfm in {path}"):
         if document["schema_version"] != SCHEMA_VERSION:
             raise ValueError(f"schema_version {document['schema_version']}")
         cameras = {
@@ -96,12 +96,6 @@ def read_film_cameras(path: Path | str) -> FilmCameras:
             metres_per_unit=document["metres_per_unit"],
             notes=tuple(document["notes"]),
         )
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            f"{path}: expected film_cameras.json of the stage sfm, got {error!r}: delete it and run again"
-        ) from None
 
 
 def _read_film(name: str, entry: dict, where: str) -> FilmCamera:

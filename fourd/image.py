@@ -105,11 +105,6 @@ def crop(image: np.ndarray, window: tuple[slice, slice]) -> np.ndarray:
     return image[window]
 
 
-def float_from_uint8(image: np.ndarray) -> np.ndarray:
-    """0-255 uint8 to 0-1 float32."""
-    return image.astype(np.float32) / np.float32(255)
-
-
 def uint8_from_float(image: np.ndarray) -> np.ndarray:
     """0-1 float to 0-255 uint8, clipped and rounded to nearest. Raises ValueError on NaN."""
     if np.isnan(image).any():

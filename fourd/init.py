@@ -59,10 +59,11 @@ def most_common_fps(sources: Sequence[Source]) -> float | None:
     return max(rates, key=lambda fps: (rates[fps], -fps)) if rates else None
 
 
-def common_num_frames(sources: Sequence[Source], fps: float) -> int:
-    """Frames at `fps` for which every source has a picture, all starting together."""
-    durations = [len(s.info.pts_s) / fps if s.files else s.info.pts_s[-1] + 1 / fps for s in sources]
-    return max(1, int(np.floor(min(durations) * fps + 1e-3)))
+def common_num_frames(sources: Sequence[Source], fps: float) -> tuple[int, int]:
+    """Frames at `fps` for which every source has a picture, all starting together; index of the shortest."""
+    durations_s = [len(s.info.pts_s) / fps if s.files else s.info.pts_s[-1] + 1 / fps for s in sources]
+    shortest = int(np.argmin(durations_s))
+    return max(1, int(np.floor(durations_s[shortest] * fps + 1e-3))), shortest
 
 
 def overlapping_num_frames(
@@ -257,13 +258,14 @@ def draft_scene(
     sources = [probe_source(Path(path), fps or DEFAULT_FPS) for path in paths]
     clock_fps = fps or most_common_fps(sources) or DEFAULT_FPS
     is_synchronized = is_synchronized or all(source.files for source in sources)
-    available, notes = common_num_frames(sources, clock_fps), ()
+    (available, shortest), notes = common_num_frames(sources, clock_fps), ()
     if not is_synchronized:
         heard, note = overlapping_num_frames(paths, sources, clock_fps)
         notes = (note,)
         if heard is None:
             notes += (
-                f"num_frames is a guess: {available}, as many as the shortest has; the run says what fits.",
+                f"num_frames is a guess: {available}, as many as {paths[shortest]}, the shortest, has; the "
+                "run says what fits.",
             )
         available = heard or available
     if num_frames is not None and not 1 <= num_frames <= available:

@@ -181,7 +181,7 @@ class ArchiveWriter:
 
 
 class Archive:
-    """Reader of an `ArchiveWriter` file; arrays are read when asked for."""
+    """Reader of an `ArchiveWriter` file; arrays are read when asked for. May be a context manager."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
@@ -194,6 +194,12 @@ class Archive:
                 "delete the file and run again"
             ) from None
         self._names = {name.removesuffix(".npy") for name in self._zip.namelist()}
+
+    def __enter__(self) -> "Archive":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def __getitem__(self, name: str) -> np.ndarray:
         """One array. Raises KeyError if there is none of that name, InputError if its bytes are damaged."""

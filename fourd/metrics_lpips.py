@@ -23,7 +23,6 @@ from fourd.image import resize_area
 if TYPE_CHECKING:
     import torch
 
-VERSION = "0.1"
 FEATURE_SIDE_PX = 227
 HOW_TO_GET = "run `python -m fourd.fetch lpips --output DIR` and set evaluate lpips_weights to DIR"
 _EPSILON = 1e-10

@@ -17,7 +17,7 @@ import numpy as np
 
 from fourd.camera import Camera, camera_from_dict
 from fourd.cli import run_stage
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.io import SCHEMA_VERSION, read_json, write_json
 from fourd.sfm.cameras import SceneCameras, read_cameras
 from fourd.trajectory import TrajectorySpec, scene_frames, trajectory_from_mapping
@@ -154,21 +154,14 @@ def read_view(path: Path | str) -> View:
             f"{path}: expected schema_version {SCHEMA_VERSION}, got {document.get('schema_version')}: "
             "delete the file and run again"
         )
-    try:
+    with explain_faults(f"a view of this workflow in {path}"):
         size = (int(document["size"][0]), int(document["size"][1]))
         if document["role"] not in ROLES or min(size) < 1:
             raise ValueError(f"role {document['role']!r}, size {size}")
         entries = tuple(
             _read_entry(entry, size, f"{path}, frame {i}") for i, entry in enumerate(document["frames"])
         )
-        view = View(Path(path).stem, document["role"], size, entries, str(document.get("status", "ok")))
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(
-            f"expected a view of this workflow at {path}, got {error!r}: delete it and run again"
-        ) from None
-    return view
+        return View(Path(path).stem, document["role"], size, entries, str(document.get("status", "ok")))
 
 
 def _read_entry(entry: Mapping[str, Any], size: tuple[int, int], where: str) -> ViewFrame:

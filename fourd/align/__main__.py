@@ -24,8 +24,8 @@ from fourd.align.vision_options import VisionOptions
 from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
 from fourd.errors import InputError
 from fourd.film_cameras import read_film_cameras
-from fourd.ingest import open_source
-from fourd.io import read_json, write_png
+from fourd.ingest import open_source, read_ingest
+from fourd.io import write_png
 
 log = logging.getLogger(__name__)
 
@@ -106,7 +106,7 @@ def _track(args: argparse.Namespace) -> None:
 
 def _solve(args: argparse.Namespace) -> None:
     request = _read_request(args)
-    documents = {str(d["camera"]): d for d in map(read_json, args.ingest)}
+    documents = {d["camera"]: d for d in map(read_ingest, args.ingest)}
     tracks = {film.name: film for film in map(read_tracks, args.tracks)}
     maps = {film.name: film for film in map(read_motion_maps, args.maps)}
     motions = {name: Motion(tracks[name], maps[name]) for name in tracks}
@@ -149,7 +149,7 @@ def _sample(args: argparse.Namespace) -> None:
         raise InputError(f"expected fps above 0 and 1 frame or more, got {args.fps} and {args.num_frames}")
     clock, start_s = CameraClock(args.offset_s), args.start_s
     if args.offsets is not None:
-        clock, start_s = clock_from_offsets(str(read_json(args.ingest)["camera"]), args.offsets)
+        clock, start_s = clock_from_offsets(read_ingest(args.ingest)["camera"], args.offsets)
     options = options_from_args(SampleOptions, args)
     run_sample(args.ingest, clock, start_s, args.fps, args.num_frames, args.output, options)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fourd.errors import InputError
+from fourd.errors import explain_faults
 from fourd.io import SCHEMA_VERSION, read_json, write_json
 
 PPM = 1e-6
@@ -99,17 +99,19 @@ def write_offsets(path: Path | str, offsets: Offsets) -> None:
 def read_offsets(path: Path | str) -> Offsets:
     """Inverse of `write_offsets`. Raises InputError, naming the file."""
     document: dict[str, Any] = read_json(path)
-    try:
+    with explain_faults(f"offsets of the stage align in {path}"):
         if document["schema_version"] != SCHEMA_VERSION:
             raise ValueError(f"schema_version {document['schema_version']}")
         return Offsets(
-            reference=document["reference"],
-            clocks={name: CameraClock(**entry) for name, entry in document["cameras"].items()},
-            start_s=document["start_s"],
+            reference=str(document["reference"]),
+            clocks={name: _read_clock(entry) for name, entry in document["cameras"].items()},
+            start_s=None if document["start_s"] is None else float(document["start_s"]),
             pairs=tuple(PairDelay(**entry) for entry in document["pairs"]),
             notes=tuple(document["notes"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: expected offsets of the stage align, got {error!r}: delete the file and run again"
-        ) from None
+
+
+def _read_clock(entry: Mapping[str, Any]) -> CameraClock:
+    clock = CameraClock(**entry)
+    numbers = ("offset_s", "rate_ppm", "sigma_s", "score")
+    return dataclasses.replace(clock, **{key: float(getattr(clock, key)) for key in numbers})

@@ -12,13 +12,13 @@ import numpy as np
 
 from fourd.align.audio_delay import SoundMatch, estimate_audio_delay
 from fourd.align.clock import CameraClock, Offsets, PairDelay
-from fourd.align.clock_graph import attach_clock, correct_sound_travel, solve_clocks
+from fourd.align.clock_graph import attach_clock, solve_clocks
 from fourd.align.options import AlignOptions
 from fourd.align.sampling import choose_start
 from fourd.align.sound import Sound, check_sound, prepare_sound
 from fourd.audio import read_audio
 from fourd.errors import InputError
-from fourd.io import read_json
+from fourd.ingest import read_ingest
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ def read_sounds(ingest_paths: Sequence[Path]) -> tuple[dict[str, Sound], dict[st
     status: dict[str, str] = {}
     first_with: dict[str, str] = {}
     for path in ingest_paths:
-        document = read_json(path)
+        document = read_ingest(path)
         name = str(document["camera"])
         film_key = f"film {document['sha256']}"
         if film_key in first_with:
@@ -96,12 +96,10 @@ def solve_by_sound(
     status: Mapping[str, str],
     inputs: Sequence[str],
     heldout: Sequence[str],
-    travel_sigma_s: float = TRAVEL_SIGMA_S,
 ) -> Offsets:
     """Clocks from delays: the inputs among themselves, then each held-out camera against them.
 
     status: by camera, why its sound cannot be compared, `ok` where it can
-    travel_sigma_s: doubt that is added for the travel of sound, 0 when `pairs` are corrected for it
     `start_s` of the result is None.
     """
     clocks = {name: CameraClock(0.0, 0.0, 0.0, 0.0, "audio", status[name]) for name in (*inputs, *heldout)}
@@ -121,29 +119,11 @@ def solve_by_sound(
             clocks[name] = attach_clock(name, pairs, fixed)
     placed = [name for name, clock in clocks.items() if clock.status == "ok" and name != reference]
     for name in placed:
-        sigma_s = math.hypot(clocks[name].sigma_s, travel_sigma_s)
+        sigma_s = math.hypot(clocks[name].sigma_s, TRAVEL_SIGMA_S)
         clocks[name] = dataclasses.replace(clocks[name], sigma_s=sigma_s)
-    if placed and travel_sigma_s > 0:
+    if placed:
         notes.append(TRAVEL_NOTE)
     return Offsets(reference, clocks, None, tuple(pairs), tuple(notes))
-
-
-def correct_offsets(
-    offsets: Offsets,
-    inputs: Sequence[str],
-    heldout: Sequence[str],
-    centers_m: Mapping[str, np.ndarray],
-    source_m: np.ndarray,
-) -> Offsets:
-    """Clocks by sound once more, without the time that sound travels (see `correct_sound_travel`).
-
-    offsets: those of `run_listen`;  centers_m: (3,) per camera;  source_m: (3,) where the sound comes from
-    """
-    compared = {name for pair in offsets.pairs for name in (pair.left, pair.right)}
-    status = {name: "ok" if name in compared else clock.status for name, clock in offsets.clocks.items()}
-    pairs = correct_sound_travel(offsets.pairs, centers_m, source_m)
-    corrected = solve_by_sound(pairs, status, inputs, heldout, travel_sigma_s=0.0)
-    return dataclasses.replace(corrected, start_s=offsets.start_s)
 
 
 def run_listen(
@@ -162,7 +142,7 @@ def run_listen(
     placed inputs film, None where there is none
     Raises InputError for a camera without an ingest file and for a film that cannot be read.
     """
-    documents = {str(read_json(path)["camera"]): path for path in ingest_paths}
+    documents = {read_ingest(path)["camera"]: path for path in ingest_paths}
     missing = [name for name in (*inputs, *heldout) if name not in documents]
     if missing:
         raise InputError(
@@ -174,7 +154,7 @@ def run_listen(
     placed = {name: offsets.clocks[name] for name in inputs if offsets.clocks[name].status == "ok"}
     if start_s is not None or len(placed) < 2:
         return dataclasses.replace(offsets, start_s=start_s), matches
-    pts = {name: np.asarray(read_json(documents[name])["pts_s"], dtype=np.float64) for name in placed}
+    pts = {name: np.asarray(read_ingest(documents[name])["pts_s"], dtype=np.float64) for name in placed}
     try:
         start_s = choose_start(placed, pts, fps, num_frames)
     except InputError as error:

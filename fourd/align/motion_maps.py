@@ -14,7 +14,7 @@ import numpy as np
 
 from fourd.align.moving_tracks import Pictures
 from fourd.camera import Camera
-from fourd.errors import InputError
+from fourd.errors import explain_faults
 from fourd.film_cameras import FilmCamera
 from fourd.io import Archive, ArchiveWriter
 
@@ -151,8 +151,7 @@ def write_motion_maps(path: Path | str, motion: MotionMaps) -> None:
 
 def read_motion_maps(path: Path | str) -> MotionMaps:
     """Inverse of `write_motion_maps`. Raises InputError, naming the file."""
-    archive = Archive(path)
-    try:
+    with Archive(path) as archive, explain_faults(f"the motion maps of a film in {path}"):
         meta, own_s = archive.meta, archive["own_s"]
         if len(own_s) == 0:
             return no_maps(meta["name"], meta["status"])
@@ -163,9 +162,3 @@ def read_motion_maps(path: Path | str) -> MotionMaps:
         )
         maps = np.stack([archive[f"{index:06d}/motion"] for index in range(len(own_s))])
         return MotionMaps(meta["name"], meta["status"], own_s, maps, cameras)
-    except KeyError as error:
-        raise InputError(
-            f"expected the motion maps of a film in {path}, it lacks {error}: delete it and run again"
-        ) from None
-    finally:
-        archive.close()

@@ -13,7 +13,7 @@ import numpy as np
 
 from fourd.align.vision_options import VisionOptions
 from fourd.camera import Camera
-from fourd.errors import InputError
+from fourd.errors import explain_faults
 from fourd.film_cameras import FilmCamera
 from fourd.io import Archive, ArchiveWriter
 
@@ -298,7 +298,7 @@ _ARRAYS = ("track", "frame", "own_s", "pixels", "descriptors", "descriptor_track
 
 
 def write_tracks(path: Path | str, motion: MovingTracks) -> None:
-    """Write align/motion/{cam}.npz."""
+    """Write align/tracks/{cam}.npz."""
     meta = {"name": motion.name, "status": motion.status, "span_s": list(motion.span_s)}
     with ArchiveWriter(path, meta) as writer:
         for key in _ARRAYS:
@@ -307,14 +307,7 @@ def write_tracks(path: Path | str, motion: MovingTracks) -> None:
 
 def read_tracks(path: Path | str) -> MovingTracks:
     """Inverse of `write_tracks`. Raises InputError, naming the file."""
-    archive = Archive(path)
-    try:
+    with Archive(path) as archive, explain_faults(f"the motion of a film in {path}"):
         meta = archive.meta
         arrays = {key: archive[key] for key in _ARRAYS}
         return MovingTracks(meta["name"], meta["status"], (meta["span_s"][0], meta["span_s"][1]), **arrays)
-    except KeyError as error:
-        raise InputError(
-            f"expected the motion of a film in {path}, it lacks {error}: delete it and run again"
-        ) from None
-    finally:
-        archive.close()

@@ -9,7 +9,8 @@ import numpy as np
 from fourd.align.clock import CameraClock, read_offsets
 from fourd.align.sampling import check_coverage, match_frames
 from fourd.errors import InputError
-from fourd.io import read_json, write_json
+from fourd.ingest import read_ingest
+from fourd.io import write_json
 
 log = logging.getLogger(__name__)
 
@@ -53,8 +54,8 @@ def run_sample(
 
     A camera without a clock, or whose film does not show every scene frame, has a status that says so.
     """
-    document = read_json(ingest_path)
-    camera = str(document["camera"])
+    document = read_ingest(ingest_path)
+    camera = document["camera"]
     common_s = clock.common_time(np.array(document["pts_s"]))
     source_frame, dt_s = match_frames(common_s, fps, num_frames, start_s)
     status = clock.status

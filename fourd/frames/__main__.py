@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from fourd import cli, io
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.flow import compensate_motion
 from fourd.frames.colour import describe_colour, match_colours
 from fourd.frames.options import FramesOptions
 from fourd.image import difference_of
-from fourd.ingest import SourceReader, open_camera
+from fourd.ingest import SourceReader, check_film, open_camera
 from fourd.sfm import read_cameras
+from fourd.tone import table_at
 
 _log = logging.getLogger("fourd.frames")
 
@@ -26,12 +27,8 @@ _log = logging.getLogger("fourd.frames")
 def read_film(path: Path) -> dict[str, Any]:
     """A film on the common clock. Raises InputError for another file."""
     document = io.read_json(path)
-    missing = [key for key in ("camera", "ingest", "status", "source_frame", "dt_s") if key not in document]
-    if missing:
-        raise InputError(
-            f"expected a film on the common clock (stage align) in {path}, got a file without "
-            f"{', '.join(missing)}: delete it and run again"
-        )
+    with explain_faults(f"a film on the common clock (stage align) in {path}"):
+        check_film(document)
     return document
 
 
@@ -92,17 +89,15 @@ def _log_colours(entries: Mapping[str, Any], reference: str | None) -> None:
 def run_prepare(film: Path, colour: Path, output: Path, options: FramesOptions) -> None:
     """Write frames/cameras/{cam}.npz: the film, its colours, and what motion changes in its pictures."""
     document = read_film(film)
-    cameras = io.read_json(colour).get("cameras", {})
-    name = str(document["camera"])
-    if name not in cameras:
-        raise InputError(
-            f"expected camera {name} in {colour}, got {', '.join(cameras) or 'none'}: delete {colour} and "
-            "run again"
-        )
+    name, found = str(document["camera"]), io.read_json(colour)
+    with explain_faults(f"camera {name} in {colour}"):
+        tone = found["cameras"][name]["tone"]
+    # A table that cannot be applied is found here, not by each of its readers.
+    table_at(tone, 0)
     is_off = not options.compensate or document["status"] != "ok"
     meta = {
         **document,
-        "tone": cameras[name]["tone"],
+        "tone": tone,
         "compensation": None if is_off else dataclasses.asdict(options.compensation),
     }
     with io.ArchiveWriter(output, meta) as writer:
@@ -115,12 +110,15 @@ def _add_moved_pixels(
 ) -> int:
     """Store, for every picture that is off in time, the pixels that differ at the frame's time."""
     num_moved = 0
-    with SourceReader(document["ingest"], film) as reader:
-        common_s = reader.pts_s * (1 + float(document["rate_ppm"]) * 1e-6)
+    with explain_faults(f"a film on the common clock in {film}"):
+        rate, sigma_s = 1 + float(document["rate_ppm"]) * 1e-6, float(document["sigma_s"])
+        reader = SourceReader(document["ingest"], film)
+    with reader:
+        common_s = reader.pts_s * rate
         for frame, (at, dt_s) in enumerate(zip(document["source_frame"], document["dt_s"], strict=True)):
             other = find_other_side(common_s, at, dt_s)
             # A shift smaller than the clock's own doubt would move pixels by what is not known.
-            if abs(dt_s) < max(options.min_dt_s, float(document["sigma_s"])) or other is None:
+            if abs(dt_s) < max(options.min_dt_s, sigma_s) or other is None:
                 continue
             image = reader.read(at)
             gap_s = abs(float(common_s[at] - common_s[other]))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fourd.camera import Camera
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.fuse.geometry import PairFrame
 from fourd.ingest import FrameReader, open_camera
 from fourd.io import Archive
@@ -55,16 +55,9 @@ class DisparityFiles:
             self._index(path, view)
 
     def _index(self, path: Path, view: str) -> None:
-        archive = Archive(path)
-        try:
+        with Archive(path) as archive, explain_faults(f"a disparity file at {path}"):
             left, right = archive.meta["left"], archive.meta["right"]
-            status = archive.meta["status"]
-        except KeyError as error:
-            raise InputError(
-                f"expected a disparity file at {path}, its meta lacks {error}: delete it and run again"
-            ) from None
-        finally:
-            archive.close()
+            status, frames = archive.meta["status"], archive.frames()
         pair = f"{left}-{right}"
         if view in (left, right):
             self.refused[pair] = f"contains the target camera {view}"
@@ -74,7 +67,6 @@ class DisparityFiles:
             return
         if pair not in self._frames:
             self.pairs.append(pair)
-        frames = archive.frames()
         self._frames.setdefault(pair, set()).update(frames)
         self._files.update({(pair, frame): path for frame in frames})
 

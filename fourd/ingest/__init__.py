@@ -5,7 +5,7 @@ In: a video, a folder of images or one image. Out: `ingest/{cam}.json` and `inge
 """
 
 from fourd.ingest.options import IngestOptions
-from fourd.ingest.reader import FrameReader, SourceReader, open_camera, open_source
+from fourd.ingest.reader import FrameReader, SourceReader, check_film, open_camera, open_source, read_ingest
 from fourd.ingest.source import Source, list_images, probe_source
 
 STAGE_VERSION = 2
@@ -15,8 +15,10 @@ __all__ = [
     "IngestOptions",
     "Source",
     "SourceReader",
+    "check_film",
     "list_images",
     "open_camera",
     "open_source",
     "probe_source",
+    "read_ingest",
 ]

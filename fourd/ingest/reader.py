@@ -1,15 +1,14 @@
 """Pictures of a camera: by its own frames (`open_source`) and by the scene's (`open_camera`)."""
 
-import contextlib
 import dataclasses
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.image import apply_difference
 from fourd.ingest.source import read_frame_image
 from fourd.io import Archive, read_json
@@ -53,10 +52,6 @@ class SourceReader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def frame_at(self, own_s: float) -> int:
-        """The frame nearest to a time on the camera's own clock, s; the earlier of two equally near."""
-        return int(np.argmin(np.abs(self.pts_s - own_s)))
 
     def read(self, source_frame: int) -> np.ndarray:
         """(H, W, 3) uint8 RGB, as displayed, of a source frame.
@@ -128,6 +123,7 @@ class FrameReader:
 
         Raises InputError if the source changed.
         """
+        check_film(document)
         self._source = SourceReader(document["ingest"], where)
         self.camera = self._source.camera
         self.size = self._source.size
@@ -195,13 +191,46 @@ class FrameReader:
             )
 
 
+def read_ingest(path: Path | str) -> dict[str, Any]:
+    """ingest/{cam}.json, checked. Raises InputError, naming the file."""
+    document = read_json(path)
+    with explain_faults(f"the output of the stage ingest in {path}"):
+        _check_ingest(document)
+    return document
+
+
+def _check_ingest(document: Mapping[str, Any]) -> None:
+    """Raise what `explain_faults` explains for a document that its readers could not rely on."""
+    size, pts_s = [int(n) for n in document["size"]], np.array(document["pts_s"], dtype=np.float64)
+    if len(size) != 2 or min(size) < 1 or len(document["pts_s"]) != int(document["num_source_frames"]):
+        raise ValueError(f"size {size} and {len(pts_s)} times of {document['num_source_frames']} frames")
+    if pts_s.ndim != 1 or len(pts_s) == 0 or not np.isfinite(pts_s).all() or (np.diff(pts_s) <= 0).any():
+        raise ValueError("times pts_s of the frames that do not rise")
+    words = {key: document[key] for key in ("camera", "source", "sha256")}
+    unsaid = [key for key, word in words.items() if not isinstance(word, str) or not word]
+    if unsaid or document["kind"] not in ("video", "images") or not isinstance(document["files"], list):
+        raise ValueError(f"kind {document['kind']!r}, and no text as {unsaid}")
+
+
+def check_film(document: Mapping[str, Any]) -> None:
+    """Raise what `explain_faults` explains unless this is a film on the common clock (docs/formats.md)."""
+    _check_ingest(document["ingest"])
+    num_source_frames = len(document["ingest"]["pts_s"])
+    frames, dt_s = document["source_frame"], np.array(document["dt_s"], dtype=np.float64)
+    if len(frames) != len(dt_s) or not all(type(i) is int and 0 <= i < num_source_frames for i in frames):
+        raise ValueError(f"{len(frames)} frames of {num_source_frames} and {len(dt_s)} times")
+    if dt_s.ndim != 1 or not np.isfinite(dt_s).all() or not isinstance(document["status"], str):
+        raise ValueError(f"status {document['status']!r} and times that are no numbers")
+
+
 def open_source(path: Path | str) -> SourceReader:
     """Reader of a camera's own pictures from ingest/{cam}.json.
 
     Raises InputError if the file is not of this stage or the source is gone or was replaced.
     """
-    with _explained(path, "ingest"):
-        return SourceReader(read_json(path), path)
+    document = read_ingest(path)
+    with explain_faults(f"the output of the stage ingest in {path}"):
+        return SourceReader(document, path)
 
 
 def open_camera(path: Path | str) -> FrameReader:
@@ -210,20 +239,8 @@ def open_camera(path: Path | str) -> FrameReader:
 
     Raises InputError if the file is not of these stages or the source is gone or was replaced.
     """
-    with _explained(path, "frames or align"):
+    with explain_faults(f"the output of the stage frames or align in {path}"):
         if Path(path).suffix != ".npz":
             return FrameReader(read_json(path), path)
         archive = Archive(path)
         return FrameReader(archive.meta, path, archive)
-
-
-@contextlib.contextmanager
-def _explained(path: Path | str, stage: str) -> Iterator[None]:
-    try:
-        yield
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"expected the output of the stage {stage} in {path}, got {error!r}: delete it and run again"
-        ) from None

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from fourd.camera import Camera, check_camera, folded_share
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.film_cameras import FilmCamera, FilmCameras
+from fourd.ingest import read_ingest
 from fourd.io import read_json
 from fourd.sfm.importers import DepthBounds, ImportedCameras
 
@@ -39,19 +40,19 @@ class IngestedCamera:
 def read_ingested(path: Path | str) -> IngestedCamera:
     """Read what is needed here of align/cameras/{cam}.json. Raises InputError for missing entries."""
     document = read_json(path)
-    try:
+    with explain_faults(f"status, source_frame and the ingest document of the align stage in {path}"):
         ingest = document["ingest"]
         size = (int(ingest["size"][0]), int(ingest["size"][1]))
         frames = tuple(int(frame) for frame in document["source_frame"])
-        digits = [re.findall(r"\d+", Path(name).stem) for name in ingest["files"]]
-        numbers = tuple(int(d[-1]) for d in digits) if all(digits) else ()
         count = int(ingest["num_source_frames"])
+        numbers = _file_numbers(ingest["files"])
         return IngestedCamera(Path(path), size, count, frames, numbers, str(document["status"]))
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(
-            f"{path}: expected status, source_frame and the ingest document of the align stage, got "
-            f"{error!r}: delete the file and run again"
-        ) from None
+
+
+def _file_numbers(files: Sequence[str]) -> tuple[int, ...]:
+    """The last number in the name of every image; none unless all have one."""
+    digits = [re.findall(r"\d+", Path(file).stem) for file in files]
+    return tuple(int(d[-1]) for d in digits) if all(digits) else ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -129,9 +130,10 @@ def _find_cameras(
         files = ", ".join(str(c.path) for c in (holders or calibrations))
         if not holders:
             known = sorted({known for c in calibrations for known in c.cameras})
-            shown = ", ".join(known[:30]) + (f" and {len(known) - 30} more" if len(known) > 30 else "")
+            more = f" and {len(known) - 30} more" if len(known) > 30 else ""
+            shown = f"only {', '.join(known[:30])}{more}" if known else "no camera"
             raise InputError(
-                f"camera {name}: expected {name_in_file!r} in {files}, found only {shown or 'no camera'}: "
+                f"camera {name}: expected {name_in_file!r} in {files}, found {shown}: "
                 "set calibration_name in the scene file"
             )
         if len(holders) > 1:
@@ -199,7 +201,7 @@ def film_cameras_of(
     found = _find_cameras(calibrations, {n: g for n, g in names_in_file.items() if n not in left_out})
     films = {}
     for name, path in ingest_paths.items():
-        document = read_json(path)
+        document = read_ingest(path)
         size = (int(document["size"][0]), int(document["size"][1]))
         if name in left_out:
             films[name] = FilmCamera(name, size, np.zeros(0, np.int64), (), status=left_out[name])
@@ -207,9 +209,7 @@ def film_cameras_of(
         calibration, given = found[name]
         where = f"{calibration.path}, camera {given}"
         count = int(document["num_source_frames"])
-        digits = [re.findall(r"\d+", Path(file).stem) for file in document["files"]]
-        numbers = tuple(int(d[-1]) for d in digits) if all(digits) else ()
-        film = IngestedCamera(path, size, count, tuple(range(count)), numbers)
+        film = IngestedCamera(path, size, count, tuple(range(count)), _file_numbers(document["files"]))
         films[name] = _film_camera(name, calibration, given, film, where)
     inputs_in_file = {given for name, given in names_in_file.items() if name not in heldout}
     points = [_points_of_inputs(calibration, inputs_in_file) for calibration in calibrations]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fourd.camera import CameraTrack, tracks_from_dict, tracks_to_dict
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.io import SCHEMA_VERSION, read_json, write_json
 
 
@@ -60,8 +60,8 @@ def read_cameras(path: Path | str) -> SceneCameras:
             f"{path}: expected schema_version {SCHEMA_VERSION}, got {document.get('schema_version')}: "
             "delete the file and run again"
         )
-    try:
-        return SceneCameras(
+    with explain_faults(f"cameras.json of this workflow in {path}"):
+        scene = SceneCameras(
             fps=float(document["fps"]),
             num_frames=int(document["num_frames"]),
             inputs=tuple(document["inputs"]),
@@ -73,9 +73,17 @@ def read_cameras(path: Path | str) -> SceneCameras:
             depth_range_from={n: e.get("depth_range_from", "given") for n, e in document["cameras"].items()},
             left_out={str(name): str(reason) for name, reason in document.get("left_out", {}).items()},
         )
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: expected cameras.json of this workflow, got {error!r}: delete it and run again"
-        ) from None
+        _check_scene(scene)
+    return scene
+
+
+def _check_scene(scene: SceneCameras) -> None:
+    """Raise ValueError where the document contradicts itself."""
+    without = [name for name in (*scene.inputs, *scene.heldout) if name not in scene.tracks]
+    if without or not scene.inputs:
+        raise ValueError(f"inputs {scene.inputs} and heldout {scene.heldout}, no camera of {without}")
+    lengths = {name: len(track.cameras) for name, track in scene.tracks.items()}
+    if any(length not in (1, scene.num_frames) for length in lengths.values()):
+        raise ValueError(f"{scene.num_frames} frames and cameras at {lengths} of them")
+    if not (scene.fps > 0 and scene.scale > 0 and np.isfinite([*scene.origin, *scene.up]).all()):
+        raise ValueError(f"fps {scene.fps}, scale {scene.scale}, origin {scene.origin}, up {scene.up}")

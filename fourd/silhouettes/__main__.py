@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fourd.cli import add_options, options_from_args, run_stage, set_num_threads
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.ingest import FrameReader, open_camera
 from fourd.io import Archive, ArchiveWriter, read_json, write_json
 from fourd.sfm.cameras import SceneCameras, read_cameras
@@ -31,7 +31,9 @@ def run_plate(
     """Write silhouettes/{cam}/plate.npz; empty, with the reason as status, where none is needed or made."""
     scene = read_cameras(cameras_path)
     with open_camera(film_path) as film:
-        status = str(read_json(need_path)["status"])
+        need = read_json(need_path)
+        with explain_faults(f"need.json of the stage silhouettes in {need_path}"):
+            status = str(need["status"])
         reason = None if status == "ok" else status
         if film.camera in scene.left_out:
             reason = f"left out: {scene.left_out[film.camera]}"
@@ -70,8 +72,9 @@ def run_segment(
     with contextlib.ExitStack() as stack:
         films: list[tuple[FrameReader, Plates]] = []
         for film_path, plate_path in zip(film_paths, plate_paths, strict=True):
-            archive = stack.enter_context(contextlib.closing(Archive(plate_path)))
-            name, status = str(archive.meta["camera"]), str(archive.meta["status"])
+            archive = stack.enter_context(Archive(plate_path))
+            with explain_faults(f"a plate of the stage silhouettes in {plate_path}"):
+                name, status = str(archive.meta["camera"]), str(archive.meta["status"])
             meta["cameras"][name] = status
             if status == "ok":
                 film = stack.enter_context(open_camera(film_path))

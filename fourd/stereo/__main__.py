@@ -5,12 +5,13 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fourd import cli, io
 from fourd.camera import CameraTrack, tracks_from_dict
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.ingest import FrameReader, open_camera
 from fourd.stereo.disparity import StereoOptions, find_row_shift, make_matcher, match_pair
 from fourd.stereo.files import (
@@ -30,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 def read_tracks(cameras_path: Path, left: str, right: str) -> tuple[CameraTrack, CameraTrack]:
     """Two cameras of a cameras file. Raises InputError if one is not in there."""
-    cameras = io.read_json(cameras_path).get("cameras", {})
+    cameras = _read_section(cameras_path, "cameras")
     for name in (left, right):
         if name not in cameras:
             raise InputError(
@@ -41,9 +42,16 @@ def read_tracks(cameras_path: Path, left: str, right: str) -> tuple[CameraTrack,
     return tracks[left], tracks[right]
 
 
+def _read_section(cameras_path: Path, key: str) -> dict[str, Any]:
+    """A mapping by camera name, unchecked: of many cameras with many poses a pair needs two."""
+    document = io.read_json(cameras_path)
+    with explain_faults(f"cameras.json of this workflow in {cameras_path}"):
+        return dict(document.get(key, {}))
+
+
 def run_rectify(cameras_path: Path, left: str, right: str, options: RectifyOptions, output: Path) -> None:
     """Rectify a pair, or refuse it, and write the result."""
-    left_out = io.read_json(cameras_path).get("left_out", {})
+    left_out = _read_section(cameras_path, "left_out")
     absent = [f"camera {name} is left out: {left_out[name]}" for name in (left, right) if name in left_out]
     if absent:
         pair = PairRectification(left, right, "; ".join(absent), 0)

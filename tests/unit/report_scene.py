@@ -132,8 +132,10 @@ def write_scores(
 def hold_out(folder: Path, num_views: int) -> None:
     """The scene with as many held-out cameras, cam01 and on; only the first one has results."""
     document = io.read_json(folder / "sfm" / "cameras.json")
+    cameras = document["cameras"]
     document["heldout"] = [f"cam{view + 1:02d}" for view in range(num_views)]
     document["left_out"] = {}
+    document["cameras"] = {name: cameras["cam01"] for name in document["heldout"]} | cameras
     document["inputs"] = [name for name in document["inputs"] if name not in document["heldout"]]
     io.write_json(folder / "sfm" / "cameras.json", document)
 

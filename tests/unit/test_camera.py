@@ -182,6 +182,7 @@ def test_track_at_a_frame():
         ({"K": np.diag([0.0, 400, 1])}, "positive focal lengths"),
         ({"K": np.diag([400.0, -400, 1])}, "positive focal lengths"),
         ({"K": np.diag([400.0, 400, 2])}, "last row 0 0 1"),
+        ({"K": np.array([[400.0, 0, 160], [1, 400, 120], [0, 0, 1]])}, "zeros below them"),
         ({"R": np.diag([1.0, 1, 1.01])}, "R must be a rotation"),
         ({"R": np.diag([1.0, 1, -1])}, "determinant -1"),
         ({"R": np.zeros((3, 3))}, "R must be a rotation"),

@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fourd import cli
@@ -39,6 +39,8 @@ def test_no_flags_give_the_defaults() -> None:
     assert parse("") == Options()
 
 
+# A busy machine's pauses are no failure.
+@settings(deadline=None)
 @given(
     st.builds(
         Options,

@@ -42,12 +42,21 @@ def test_offsets_read_back_equal(tmp_path):
     assert read_offsets(tmp_path / "offsets.json") == make_offsets()
 
 
-@pytest.mark.parametrize("change", [{"cameras": {"cam00": {"shift": 1}}}, {"schema_version": 99}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"cameras": {"cam00": {"shift": 1}}},
+        {"cameras": {"cam00": {"offset_s": None}}},
+        {"cameras": 7},
+        {"start_s": []},
+        {"schema_version": 99},
+    ],
+)
 def test_other_files_are_refused(tmp_path, change):
     path = tmp_path / "offsets.json"
     write_offsets(path, make_offsets())
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(InputError, match="offsets.json: expected offsets of the stage align"):
+    with pytest.raises(InputError, match=r"expected offsets of the stage align in .*offsets\.json"):
         read_offsets(path)
 
 

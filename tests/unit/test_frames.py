@@ -14,7 +14,7 @@ from fourd.frames.__main__ import main
 from fourd.frames.colour import LEVELS, describe_colour, match_colours
 from fourd.frames.fit import fit_colours
 from fourd.frames.observations import ColourPairs, make_sample
-from fourd.ingest.source import probe_source
+from fourd.ingest.source import hash_source, probe_source
 from fourd.io import Archive, read_json, write_json, write_png
 from fourd.sfm import SceneCameras, write_cameras
 from fourd.tone import apply_tone, identity_table, table_at
@@ -196,6 +196,8 @@ def write_film(folder: Path, name: str, pictures: list[np.ndarray], status: str 
         "start_s": 0.0,
         "files": list(probed.files),
         "num_bytes": probed.num_bytes,
+        "num_source_frames": len(pictures),
+        "sha256": hash_source(source, probed.files),
     }
     count = len(pictures) if status == "ok" else 0
     path = folder / "align" / f"{name}.json"

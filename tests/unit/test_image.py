@@ -67,6 +67,13 @@ def test_undistort_marks_what_the_camera_did_not_see():
     assert (result[valid] == 200).all()
 
 
+def test_convention_a_blank_is_invalid_not_black():
+    black = np.zeros((64, 96, 3), np.uint8)
+    result, valid = im.undistort(black, make_camera(), make_camera(focal=45.0))
+    assert (result == 0).all()
+    assert valid[32, 48] and not valid[0, 0]
+
+
 def test_undistort_refuses_what_it_cannot_mean():
     camera = make_camera()
     other = Camera(camera.K, camera.R, camera.t + 0.1, camera.size)
@@ -89,7 +96,7 @@ def test_padding_is_undone_by_crop(height, width, multiple):
 
 def test_uint8_float_round_trip_is_exact():
     levels = np.arange(256, dtype=np.uint8)
-    assert (im.uint8_from_float(im.float_from_uint8(levels)) == levels).all()
+    assert (im.uint8_from_float(levels / np.float32(255)) == levels).all()
     assert im.uint8_from_float(np.array([-1.0, 2.0])).tolist() == [0, 255]
     with pytest.raises(ValueError, match="NaN"):
         im.uint8_from_float(np.array([np.nan]))

@@ -8,7 +8,7 @@ import pytest
 from fourd.align.sampling import match_frames
 from fourd.errors import InputError
 from fourd.image import difference_of
-from fourd.ingest import IngestOptions, open_camera
+from fourd.ingest import IngestOptions, open_camera, open_source, read_ingest
 from fourd.ingest.__main__ import run
 from fourd.io import ArchiveWriter, read_json, write_json, write_png
 from fourd.tone import identity_table
@@ -85,7 +85,32 @@ def test_pixels_that_motion_changes_come_from_the_archive(tmp_path):
             np.testing.assert_array_equal(reader.read(2, **plain), picture(2))
 
 
-@pytest.mark.parametrize("change", [{"source_frame": None}, {"ingest": {}}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"camera": 3},
+        {"size": [160]},
+        {"size": [160, 0]},
+        {"size": 7},
+        {"pts_s": [0.0, 0.1]},
+        {"pts_s": [0.1] * 10},
+        {"pts_s": []},
+        {"files": None},
+        {"kind": "sound"},
+        {"sha256": ""},
+    ],
+)
+def test_damaged_ingest_documents_are_refused(tmp_path, change):
+    write_camera(tmp_path)
+    write_json(tmp_path / "i.json", {**read_json(tmp_path / "i.json"), **change})
+    for read in (read_ingest, open_source):
+        with pytest.raises(InputError, match=r"expected the output of the stage ingest in .*i\.json"):
+            read(tmp_path / "i.json")
+
+
+@pytest.mark.parametrize(
+    "change", [{"source_frame": None}, {"ingest": {}}, {"ingest": None}, {"dt_s": [0.0]}]
+)
 def test_foreign_documents_are_refused(tmp_path, change):
     with pytest.raises(InputError, match="expected the output of the stage frames or align in"):
         open_camera(write_camera(tmp_path, **change))

@@ -145,10 +145,10 @@ def test_bad_inputs_are_refused(tmp_path):
 
 
 def test_films_without_sound_get_a_guess_that_is_named_as_one(tmp_path, capsys):
-    films = [make_film(tmp_path / f"{n}.mp4", 5) for n in "ab"]
+    films = [make_film(tmp_path / f"{n}.mp4", count) for n, count in (("a", 9), ("b", 5))]
     scene = init(tmp_path, *films)
     assert scene["num_frames"] == 5 and "clock" not in scene and "calibration" not in scene
-    assert "num_frames is a guess: 5" in capsys.readouterr().out
+    assert f"num_frames is a guess: 5, as many as {films[1]}, the shortest" in capsys.readouterr().out
 
 
 def test_every_key_is_explained():

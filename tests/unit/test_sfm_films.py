@@ -71,8 +71,12 @@ def test_fewer_than_two_inputs_that_remain_are_refused_with_all_reasons(tmp_path
 
 
 def write_source(folder: Path, name: str, num_frames: int, size=SIZE, files=()) -> Path:
-    """ingest/{cam}.json, as far as the stage sfm looks at it."""
-    document = {"camera": name, "size": list(size), "num_source_frames": num_frames, "files": list(files)}
+    """ingest/{cam}.json, as far as it is checked."""
+    document = {
+        "camera": name, "source": f"{name}.mp4", "kind": "images" if files else "video", "sha256": name,
+        "size": list(size), "num_source_frames": num_frames, "files": list(files),
+        "pts_s": [frame / 30 for frame in range(num_frames)],
+    }  # fmt: skip
     path = folder / f"{name}.json"
     path.write_text(json.dumps(document))
     return path

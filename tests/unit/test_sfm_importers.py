@@ -88,6 +88,8 @@ def test_nerfstudio_accepts_an_opening_angle(tmp_path):
         ({"k4": 0.1}, r"cam00\.png: expected a perspective camera model.*k4"),
         ({"w": None}, r"cam00\.png: expected w, h, fl_x"),
         ({"transform_matrix": [[1, 0], [0, 1]]}, r"cam00\.png: expected w, h, fl_x"),
+        ({"transform_matrix": 1.0}, r"cam00\.png: expected w, h, fl_x"),
+        ({"w": float("inf")}, r"cam00\.png: expected w, h, fl_x"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, r"cam00\.png: R must be a rotation"),
         ({"file_path": ""}, "expected a `file_path` of its own"),
     ],

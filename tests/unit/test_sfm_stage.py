@@ -98,8 +98,23 @@ def test_written_cameras_are_read_back(tmp_path):
     write_cameras(tmp_path / "again.json", scene)
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "sfm" / "cameras.json").read_bytes()
     (tmp_path / "again.json").write_text('{"schema_version": 1, "fps": 30}')
-    with pytest.raises(InputError, match=r"again\.json: expected cameras\.json of this workflow"):
+    with pytest.raises(InputError, match=r"expected cameras\.json of this workflow in .*again\.json"):
         read_cameras(tmp_path / "again.json")
+    for change in (
+        {"inputs": ["cam09"]},
+        {"num_frames": 3},
+        {"up": [0, 1]},
+        {"left_out": 7},
+        {"cameras": 7},
+        {"cameras": {"cam00": 7}},
+        {"cameras": {"cam00": {"size": [1], "frames": []}}},
+        {"cameras": {"cam00": {"size": [64, 48], "near": 2, "far": 1, "frames": [{}]}}},
+    ):
+        write_cameras(tmp_path / "again.json", scene)
+        document = json.loads((tmp_path / "again.json").read_text())
+        (tmp_path / "again.json").write_text(json.dumps({**document, **change}))
+        with pytest.raises(InputError, match=r"^expected .* in .*again\.json.* delete it and run again"):
+            read_cameras(tmp_path / "again.json")
     (tmp_path / "again.json").write_text('{"schema_version": 99}')
     with pytest.raises(InputError, match="expected schema_version 1, got 99"):
         read_cameras(tmp_path / "again.json")
@@ -353,7 +368,7 @@ def test_flags():
 
 def test_a_file_that_is_no_ingest_file_is_refused(tmp_path):
     (tmp_path / "cam00.json").write_text('{"size": [1]}')
-    with pytest.raises(InputError, match=r"cam00\.json: expected status, source_frame"):
+    with pytest.raises(InputError, match=r"expected status, source_frame .*cam00\.json"):
         read_ingested(tmp_path / "cam00.json")
 
 

@@ -62,7 +62,7 @@ def _camera_from_frame(values: Mapping[str, Any], where: str) -> Camera:
         cx, cy = float(values.get("cx", size[0] / 2)), float(values.get("cy", size[1] / 2))
         distortion = np.array([float(values.get(key, 0)) for key in LENS_KEYS])
         world_from_cam = np.asarray(values["transform_matrix"], dtype=np.float64)[:3].reshape(3, 4)
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, OverflowError, TypeError, ValueError) as error:
         raise InputError(
             f"{where}: expected w, h, fl_x (or camera_angle_x) and a 4x4 transform_matrix, got {error!r}: "
             "add them at the top of the file or to the frame"

@@ -12,8 +12,7 @@ import pycolmap
 from fourd.align.clock import read_offsets
 from fourd.errors import InputError
 from fourd.film_cameras import FilmCamera, write_film_cameras
-from fourd.ingest import open_source
-from fourd.io import read_json
+from fourd.ingest import open_source, read_ingest
 from fourd.sfm.recover.films import Film, focal_guess_px, select_frames
 from fourd.sfm.recover.options import RecoverOptions
 from fourd.sfm.recover.recover import recover_cameras
@@ -56,8 +55,8 @@ def run_recover(
         # Held-out films last: of two equal ones the input is the original.
         for name in sorted(ingest_paths, key=lambda name: name in heldout):
             path = ingest_paths[name]
-            document = read_json(path)
-            original = first_with.setdefault(str(document["sha256"]), name)
+            document = read_ingest(path)
+            original = first_with.setdefault(document["sha256"], name)
             if original != name:
                 size = (int(document["size"][0]), int(document["size"][1]))
                 status = f"same recording as {original}: no second view of anything"
