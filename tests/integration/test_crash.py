@@ -107,8 +107,8 @@ def test_killed_at_random_moments_it_goes_on_and_ends_with_the_same_bytes(
         after = finished(tmp_path)
         assert {path: after.get(path) for path in before} == before
         before = after
-        # A killed engine leaves its lock; a second run says so, see below.
-        shutil.rmtree(tmp_path / ".snakemake" / "locks")
+        # A killed engine leaves its lock, unless it was at its very end; a second run says so, see below.
+        shutil.rmtree(tmp_path / ".snakemake" / "locks", ignore_errors=True)
     print(f"killed {kills} times")
     assert kills >= KILLS // 2
     result = workspace.snakemake("--cores", "2", "--rerun-incomplete", "render_all")
