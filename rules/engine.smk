@@ -11,9 +11,10 @@ atexit.register(gc.freeze)
 
 def calm_engine():
     """For a run, once its jobs are known."""
-    # The graph is not garbage; what each job leaves is looked for among what came after it.
+    # The graph is not garbage; what jobs leave is looked for among what came after it, and soon: rare
+    # searches let it pile up by 4 kB a job.
     gc.freeze()
-    gc.set_threshold(100_000, 10, 10)
+    gc.set_threshold(5_000, 10, 10)
     gc.enable()
     # With a limit of jobs per second, which there is unless it is asked for another, every round of the
     # scheduler starts a timer that starts one more: rounds per second grow with the jobs that are done.
