@@ -27,8 +27,8 @@ FEATURE_SIDE_PX = 227
 HOW_TO_GET = "run `python -m fourd.fetch lpips --output DIR` and set evaluate lpips_weights to DIR"
 _EPSILON = 1e-10
 # The mean and deviation of ImageNet on the scale -1 to 1, as LPIPS 0.1 rounds them.
-_MEAN = (-0.030, -0.088, -0.188)
-_SCALE = (0.458, 0.448, 0.450)
+MEAN = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,19 +127,24 @@ class FeatureNetwork:
     def features(self, image: np.ndarray) -> list["torch.Tensor"]:
         """(1, C, h, w) float32 activations of the scored layers; image: (H, W, 3) uint8 RGB."""
         import torch
-        from torch.nn import functional
 
         scaled = image.astype(np.float32) / np.float32(127.5) - np.float32(1)
-        scaled = (scaled - np.array(_MEAN, np.float32)) / np.array(_SCALE, np.float32)
+        scaled = (scaled - np.array(MEAN, np.float32)) / np.array(SCALE, np.float32)
         x = torch.from_numpy(np.ascontiguousarray(scaled.transpose(2, 0, 1)[None], np.float32))
-        found = []
         with torch.inference_mode():
-            for layer, (kernel, bias) in zip(self._layers, self._weights, strict=True):
-                if layer.pool is not None:
-                    x = functional.max_pool2d(x, *layer.pool)
-                x = functional.relu(functional.conv2d(x, kernel, bias, layer.stride, layer.padding))
-                if layer.is_scored:
-                    found.append(x)
+            return self.activate(x)
+
+    def activate(self, x: "torch.Tensor") -> list["torch.Tensor"]:
+        """The same of (B, 3, H, W) pictures on the scale -1 to 1, less `MEAN`, over `SCALE`."""
+        from torch.nn import functional
+
+        found = []
+        for layer, (kernel, bias) in zip(self._layers, self._weights, strict=True):
+            if layer.pool is not None:
+                x = functional.max_pool2d(x, *layer.pool)
+            x = functional.relu(functional.conv2d(x, kernel, bias, layer.stride, layer.padding))
+            if layer.is_scored:
+                found.append(x)
         return found
 
     def distance(self, first: Sequence["torch.Tensor"], second: Sequence["torch.Tensor"]) -> float:

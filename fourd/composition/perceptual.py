@@ -7,20 +7,16 @@ perceptual metric", CVPR 2018.
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from fourd.checksum import check_sha256
 from fourd.errors import InputError
-from fourd.metrics_lpips import NETWORKS, FeatureNetwork, read_arrays_only
+from fourd.metrics_lpips import MEAN, NETWORKS, SCALE, FeatureNetwork, read_arrays_only
 
 # Of the two networks that LPIPS is made with the one that costs a step little.
 NET = "alex"
 # Activations are scaled to length 1; where all are 0 the root has no gradient without it.
 _EPSILON = 1e-10
-# The mean and deviation of ImageNet on the scale -1 to 1, as LPIPS 0.1 rounds them.
-_MEAN = (-0.030, -0.088, -0.188)
-_SCALE = (0.458, 0.448, 0.450)
 
 
 class PerceptualLoss(FeatureNetwork):
@@ -47,24 +43,17 @@ class PerceptualLoss(FeatureNetwork):
         """Mean distance, 0 if both are equal where there is a target; arguments as in `losses`."""
         blank = torch.zeros_like(output)
         with torch.no_grad():
-            wanted = self._activations(torch.where(valid, target, blank))
-        found = self._activations(torch.where(valid, output, blank))
+            wanted = self._activate(torch.where(valid, target, blank))
+        found = self._activate(torch.where(valid, output, blank))
         terms = [
             ((_unit(a) - _unit(b)).square() * head).sum(dim=1).mean()
             for a, b, head in zip(found, wanted, self._heads, strict=True)
         ]
         return torch.stack(terms).sum()
 
-    def _activations(self, image: Tensor) -> list[Tensor]:
-        mean, scale = (torch.tensor(v, device=image.device).view(1, 3, 1, 1) for v in (_MEAN, _SCALE))
-        x, found = (2 * image - 1 - mean) / scale, []
-        for layer, (kernel, bias) in zip(self._layers, self._weights, strict=True):
-            if layer.pool is not None:
-                x = F.max_pool2d(x, *layer.pool)
-            x = F.relu(F.conv2d(x, kernel, bias, layer.stride, layer.padding))
-            if layer.is_scored:
-                found.append(x)
-        return found
+    def _activate(self, image: Tensor) -> list[Tensor]:
+        mean, scale = (torch.tensor(v, device=image.device).view(1, 3, 1, 1) for v in (MEAN, SCALE))
+        return self.activate((2 * image - 1 - mean) / scale)
 
 
 def _unit(x: Tensor) -> Tensor:

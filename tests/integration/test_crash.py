@@ -108,7 +108,9 @@ def test_killed_at_random_moments_it_goes_on_and_ends_with_the_same_bytes(
         assert {path: after.get(path) for path in before} == before
         before = after
         # A killed engine leaves its lock, unless it was at its very end; a second run says so, see below.
-        shutil.rmtree(tmp_path / ".snakemake" / "locks", ignore_errors=True)
+        locks = tmp_path / ".snakemake" / "locks"
+        if locks.is_dir():
+            shutil.rmtree(locks)
     print(f"killed {kills} times")
     assert kills >= KILLS // 2
     result = workspace.snakemake("--cores", "2", "--rerun-incomplete", "render_all")
