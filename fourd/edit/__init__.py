@@ -4,4 +4,4 @@ In: config/edits/{edit}.yaml, frames, cameras and disparities of a scene, its ba
 Out: edit/{edit}/masks.npz, edit/{edit}/{view}/{chunk}/ and edit/{edit}/{view}.mp4 (docs/editing.md).
 """
 
-STAGE_VERSION = 3
+STAGE_VERSION = 4

@@ -137,6 +137,16 @@ def main(argv: Sequence[str] | None = None) -> None:
         options = options_from_args(FuseOptions, args)
         depths.run(args.cameras, args.frames, args.disparity, args.films, options, args.output)
         return
+    try:
+        run_edit(args)
+    except InputError as error:
+        # Of many edits in one run, a person has to know whose mark or view it is.
+        where = "" if str(args.edit) in str(error) else f"{args.edit}: "
+        raise InputError(f"{where}{error}") from None
+
+
+def run_edit(args: argparse.Namespace) -> None:
+    """Run `masks` or `view`. Raises InputError."""
     edit, options = read_edit(args.edit), options_from_args(EditOptions, args)
     if args.command == "masks":
         from fourd.edit import masks

@@ -24,7 +24,10 @@ from fourd.edit.voxels import (
     UNKNOWN,
     MovingVoxels,
     distances_to,
+    find_specks,
+    find_strays,
     gather_voxels,
+    is_one_thing,
     settle_labels,
     vote_labels,
 )
@@ -126,16 +129,22 @@ def find_frame(
     hints: Mapping[str, np.ndarray],
     before: tuple[np.ndarray, np.ndarray] | None = None,
     colours: Colours | None = None,
+    is_one: bool = False,
 ) -> Found:
     """The thing at one frame, from what each camera believes of it.
 
     hints: camera -> (H, W) uint8 OBJECT, OTHER or UNKNOWN
     before: points of the thing and of what else moves in the neighbouring frame;  colours: of the thing
+    is_one: whether what lies apart from it is somebody else's
     """
     voxels = voxels_of(instant, side)
     beliefs = None if colours is None else {n: colours.of(image) for n, image in instant.images.items()}
     labels = settle_labels(voxels, vote_labels(voxels, hints, before, beliefs))
-    points, others = voxels.centers[labels == OBJECT], voxels.centers[labels == OTHER]
+    if is_one:
+        ours = np.flatnonzero(labels == OBJECT)
+        labels[ours[find_strays(voxels.centers[ours], side)]] = OTHER
+    is_speck = find_specks(voxels, labels, before)
+    points, others = voxels.centers[labels == OBJECT], voxels.centers[(labels == OTHER) & ~is_speck]
     still = _still_nearby(instant, points, side)
     masks, kinds = {}, {}
     for name, image in instant.images.items():
@@ -144,6 +153,7 @@ def find_frame(
         kind[at >= 0] = labels[at[at >= 0]]
         is_mover = (at >= 0) & (kind == OTHER)
         kind[is_mover] = MOVER
+        is_mover[is_mover] = ~is_speck[at[is_mover]]
         ours = splat_points(instant.cameras[name], points, side)
         theirs = splat_points(instant.cameras[name], others, side)
         masks[name] = refine_outline(image, kind, ours < theirs, instant.plate_finder(name, points))
@@ -223,6 +233,8 @@ def carry_mark(
     colours = learn_colours(
         load(frame).images, {name: (kind == OBJECT, kind == OTHER) for name, kind in kinds.items()}
     )
+    # A ball that flew past goes with who it passed until it is apart again.
+    is_one = is_one_thing(found[frame].points, side)
     start = list(frames).index(frame)
     for order in (frames[start + 1 :], frames[:start][::-1]):
         before, at = load(frame), frame
@@ -232,7 +244,9 @@ def carry_mark(
                 name: carry(image, before.images[name], found[at].kinds[name])
                 for name, image in instant.images.items()
             }
-            found[now] = find_frame(instant, side, carried, (found[at].points, found[at].others), colours)
+            found[now] = find_frame(
+                instant, side, carried, (found[at].points, found[at].others), colours, is_one
+            )
             before, at = instant, now
             log.info("frame %d: %d voxels", now, len(found[now].points))
     return found

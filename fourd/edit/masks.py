@@ -45,6 +45,7 @@ def run(
         frame, hints, side = first_hints(edit, places, instants)
         frames = instants.frames
         found = carry_mark(hints, frame, frames, instants.at, side, carry)
+        check_marked(edit.marks[0], found[frame].masks)
         for _ in range(edit.order - 1):
             found = _with_hidden(found, frame, places[0], scene, views, edit.marks[0], instants, side)
         _warn_of_lost(edit, found)
@@ -79,7 +80,7 @@ def place_of_mark(mark: Mark, scene: SceneCameras, views: Mapping[str, View]) ->
     if mark.view in scene.tracks:
         return mark.frame, scene.tracks[mark.view].at(mark.frame).without_distortion()
     if mark.view not in views:
-        raise InputError(f"{mark.describe()}: expected views/{mark.view}.json, got none: give --view-files")
+        raise InputError(f"{mark.describe()}: expected views/{mark.view}.json, got none: give --mark-views")
     entry = views[mark.view].at(mark.frame)
     return entry.scene_frame, entry.camera
 
@@ -112,6 +113,19 @@ def first_hints(
         for mark, mask, (_, camera) in zip(edit.marks, masks, places, strict=True)
     ]
     return frame, merge_hints(several), side
+
+
+def check_marked(mark: Mark, masks: Mapping[str, np.ndarray]) -> None:
+    """Raise InputError where nothing is left of a mark on its own picture: what moved there was noise.
+
+    masks: camera -> (H, W) bool of the marked frame
+    """
+    own = [masks[mark.view]] if mark.view in masks else masks.values()
+    if not any(mask.any() for mask in own):
+        raise InputError(
+            f"{mark.describe()}: expected something that moves, but no part of it moves as one thing would; "
+            "mark the thing closer, or on another frame or camera"
+        )
 
 
 def _voxel_side(instant: Instant, mark: Mark, mask: np.ndarray, camera: Camera) -> float:
@@ -149,9 +163,16 @@ def _with_hidden(
 
 
 def _warn_of_lost(edit: Edit, found: Mapping[int, Found]) -> None:
-    lost = [f for f, result in found.items() if not len(result.points)]
+    lost = sorted(f for f, result in found.items() if not any(mask.any() for mask in result.masks.values()))
     if lost:
         log.warning(
-            "%s: the marked thing is in no view at %d of %d frames (%d to %d): these stay as they are",
-            edit.name, len(lost), len(found), min(lost), max(lost),
+            "%s: the marked thing was found in no view at %d of %d frames (%s), so nothing is done to it "
+            "there; if it is to be seen, mark it there in an edit of its own",
+            edit.name, len(lost), len(found), _spans(lost),
         )  # fmt: skip
+
+
+def _spans(frames: Sequence[int]) -> str:
+    """`3 to 5, 9` for [3, 4, 5, 9]."""
+    runs = np.split(np.array(frames), np.flatnonzero(np.diff(frames) > 1) + 1)
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from fourd.edit.plate import Window, is_plate
+from fourd.edit.plate import Window, is_no_plate, is_plate
 from fourd.edit.voxels import MOVER, OBJECT, OTHER, UNKNOWN
 
 # Pixels on either side of an outline by depth that colour may decide.
@@ -36,8 +36,8 @@ def refine_outline(
     likely: (H, W) bool where other cameras see the thing, and nobody before it
     find_plate: gives (h, w, 3) uint8 what stands still in a window, and (h, w) bool where that is known
     What lies well inside or outside stays. Along the outline, and where nobody knows, what looks as it does
-    at other times is not the thing; the rest is cut by colour. Where another one is in front, its depth is
-    too wide as well, so the rim of it may be the thing's.
+    at other times is not the thing, and what surely looks unlike is; the rest is cut by colour. Where another
+    one is in front, its depth is too wide as well, so the rim of it may be the thing's.
     Source of the cut: C. Rother et al., "GrabCut", SIGGRAPH 2004.
     """
     inside = cv2.morphologyEx((kind == OBJECT).astype(np.uint8), cv2.MORPH_CLOSE, _disc(2))
@@ -51,7 +51,9 @@ def refine_outline(
     plate, known = find_plate(window)[:2]
     same = known & is_plate(picture, plate)
     differs = known & ~same
-    near = (cv2.dilate(part, _disc(_OUTER_PX)) > 0) | _find_limbs(part, differs, told)
+    limbs = _find_limbs(part, differs, told)
+    near = (cv2.dilate(part, _disc(_OUTER_PX)) > 0) | limbs
+    sure = _open(known & is_no_plate(picture, plate) & (limbs | (part > 0)))
     mover = ((told == MOVER) & (part == 0)).astype(np.uint8)
     core = (part > 0) & (cv2.erode(part | mover, _disc(_INNER_PX)) > 0)
     edge = (cv2.erode(part, _disc(_EDGE_PX)) == 0) & (part > 0)
@@ -63,7 +65,7 @@ def refine_outline(
     trimap[_find_contact(part, mover) & differs] = cv2.GC_PR_BGD
     trimap[(told == OTHER) & maybe & (part == 0) & ~same] = cv2.GC_PR_FGD
     trimap[part > 0] = cv2.GC_PR_FGD
-    trimap[core & ~same] = cv2.GC_FGD
+    trimap[(core & ~same) | sure] = cv2.GC_FGD
     trimap[edge & same] = cv2.GC_PR_BGD
     if not (trimap == cv2.GC_BGD).any() or not (trimap == cv2.GC_FGD).any():
         return inside > 0
@@ -89,12 +91,17 @@ def _find_limbs(part: np.ndarray, differs: np.ndarray, told: np.ndarray) -> np.n
         for region in (part > 0, told == MOVER)
     )
     free = differs & (told != MOVER) & (ours <= _LIMB_PX) & (ours < theirs)
-    free = cv2.morphologyEx(free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    free = _open(free)
     joined = (free | (part > 0)).astype(np.uint8)
     labels = np.asarray(cv2.connectedComponents(joined)[1], dtype=np.int64)
     touched = np.zeros(int(labels.max()) + 1, bool)
     touched[np.unique(labels[part > 0])] = True
     return touched[labels] & free
+
+
+def _open(mask: np.ndarray) -> np.ndarray:
+    """The mask without what is thinner than three pixels."""
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
 
 
 def widen(mask: np.ndarray, radius: int) -> np.ndarray:

@@ -16,6 +16,8 @@ NEAREST, FARTHEST = 0.2, 100.0
 _SAME = 0.03
 # A picture is as bright as its plate times 1, give or take noise, or darker in a shadow.
 _NOISE_LEVELS = 14.0
+# More than that beside the best light and place is something else.
+_SURE_LEVELS = 21.0
 _DARKEST_SHADOW = 0.35
 
 
@@ -109,7 +111,30 @@ def is_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
 
     image, plate: (H, W, 3) uint8. A shadow darkens all three channels about alike.
     """
-    picture, ground = (cv2.GaussianBlur(i.astype(np.float32), (0, 0), 0.7) for i in (image, plate))
+    return _difference(*_smooth(image, plate)) <= _NOISE_LEVELS
+
+
+def is_no_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
+    """(H, W) bool: the picture surely shows something else, as the plate a pixel to any side is unlike too.
+
+    image, plate: (H, W, 3) uint8. Neither noise, a shadow nor a plate that is off by a pixel differ so much.
+    """
+    picture, ground = _smooth(image, plate)
+    height, width = ground.shape[:2]
+    around = np.pad(ground, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    least = np.full((height, width), np.inf, np.float32)
+    for dy in range(3):
+        for dx in range(3):
+            np.minimum(least, _difference(picture, around[dy : dy + height, dx : dx + width]), out=least)
+    return least > _SURE_LEVELS
+
+
+def _smooth(*images: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple(cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.7) for image in images)
+
+
+def _difference(picture: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """(H, W) float32 grey levels by which a picture is off the ground in the light that fits best."""
     share = (picture * ground).sum(axis=2) / np.maximum((ground * ground).sum(axis=2), 1.0)
     share = np.clip(share, _DARKEST_SHADOW, 1.0)[..., None]
-    return np.abs(picture - share * ground).max(axis=2) <= _NOISE_LEVELS
+    return np.abs(picture - share * ground).max(axis=2)

@@ -10,7 +10,7 @@ from fourd.edit.carry import Found, Instant, splat_points, voxels_of
 from fourd.edit.moving import project_ideal, world_points
 from fourd.edit.outline import RIM_PX, widen
 from fourd.edit.spec import Mark
-from fourd.edit.voxels import OBJECT, OTHER, UNKNOWN, distances_to, find_parts
+from fourd.edit.voxels import OBJECT, OTHER, UNKNOWN, distances_to, find_parts, find_strangers
 from fourd.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ def _check_mark(mark: Mark, mask: np.ndarray, has_depth: np.ndarray, moving: np.
 def _drop_passers(instant: Instant, hints: Mapping[str, np.ndarray], side: float) -> dict[str, np.ndarray]:
     """Hints without the parts that a box only touches, and those that lie apart from its largest one."""
     voxels = voxels_of(instant, side)
-    parts = find_parts(voxels)
+    parts = find_parts(voxels.centers, side)
     num = int(parts.max()) + 1 if len(parts) else 0
     ours, theirs = np.zeros(num), np.zeros(num)
     for name, hint in hints.items():
@@ -112,22 +112,6 @@ def _drop_passers(instant: Instant, hints: Mapping[str, np.ndarray], side: float
         is_passer = (at >= 0) & passes[parts[np.maximum(at, 0)]] if num else np.zeros(at.shape, bool)
         result[name] = np.where(is_passer & (hint == OBJECT), OTHER, hint).astype(np.uint8)
     return result
-
-
-def find_strangers(centers: np.ndarray, parts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """(P,) bool parts that lie farther from the part with most counts, (P,), than they are long themselves.
-
-    What a missing depth cuts off from a figure is longer than the gap.
-    """
-    main = int(counts.argmax())
-    gaps = distances_to(centers, centers[parts == main], np.inf)
-    nearest = np.full(len(counts), np.inf)
-    low = np.full((len(counts), 3), np.inf)
-    np.minimum.at(nearest, parts, gaps)
-    np.minimum.at(low, parts, centers)
-    high = np.full(low.shape, -np.inf)
-    np.maximum.at(high, parts, centers)
-    return nearest > np.linalg.norm(high - low, axis=1)
 
 
 def merge_hints(several: list[tuple[Mark, dict[str, np.ndarray]]]) -> dict[str, np.ndarray]:
@@ -159,7 +143,8 @@ def hints_of_hidden(
     hidden = np.zeros(len(z), bool)
     hidden[inside] = front[y[inside], x[inside]] < z[inside] - side
     hidden &= is_other
-    parts = find_parts(voxels, is_other)
+    parts = np.zeros(len(z), np.int32)
+    parts[is_other] = find_parts(voxels.centers[is_other], side)
     counts = np.bincount(parts[hidden], minlength=int(parts.max(initial=0)) + 1)
     chosen = counts >= max(_MIN_HIDDEN_VOXELS, _MIN_HIDDEN_SHARE * len(found.points))
     if not chosen.any():

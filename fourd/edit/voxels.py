@@ -21,6 +21,8 @@ _REACH = 2.0
 _MIN_PIXELS = 3
 # Rounds in which voxels go with the majority around them.
 _ROUNDS = 3
+# Of the thing's voxels: what hangs on it and is less is no second thing.
+_SPECK_SHARE = 0.06
 # Votes of a colour that only the thing has, or only others have.
 _COLOUR_VOTES = 2.0
 _BITS = 20
@@ -103,13 +105,61 @@ def vote_labels(
     return np.where(balance > 0, OBJECT, np.where(balance < 0, OTHER, UNKNOWN)).astype(np.uint8)
 
 
-def find_parts(voxels: MovingVoxels, chosen: np.ndarray | None = None) -> np.ndarray:
-    """(V,) int32 connected part of every voxel; those not chosen, (V,) bool, are parts by themselves."""
-    graph = _graph(voxels)
-    if chosen is not None:
-        keep = diags(chosen.astype(float))
-        graph = keep @ graph @ keep
-    return connected_components(graph, directed=False)[1].astype(np.int32)
+def find_parts(points: np.ndarray, side: float) -> np.ndarray:
+    """(V,) int32 connected part of every voxel centre, (V, 3)."""
+    return connected_components(_graph(points, side), directed=False)[1].astype(np.int32)
+
+
+def find_strangers(points: np.ndarray, parts: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(P,) bool parts that lie farther from the part with most counts, (P,), than they are long themselves.
+
+    points: (V, 3);  parts: (V,) of `find_parts`
+    What a missing depth cuts off from a figure is longer than the gap.
+    """
+    main = int(counts.argmax())
+    gaps = distances_to(points, points[parts == main], np.inf)
+    nearest = np.full(len(counts), np.inf)
+    low = np.full((len(counts), 3), np.inf)
+    np.minimum.at(nearest, parts, gaps)
+    np.minimum.at(low, parts, points)
+    high = np.full(low.shape, -np.inf)
+    np.maximum.at(high, parts, points)
+    return nearest > np.linalg.norm(high - low, axis=1)
+
+
+def find_strays(points: np.ndarray, side: float) -> np.ndarray:
+    """(V,) bool points of a thing, (V, 3), that lie apart from most of it and belong to somebody else."""
+    if not len(points):
+        return np.zeros(0, bool)
+    parts = find_parts(points, side)
+    return find_strangers(points, parts, np.bincount(parts))[parts]
+
+
+def is_one_thing(points: np.ndarray, side: float) -> bool:
+    """Whether voxels, (V, 3) centres, are one thing and not several that were marked together."""
+    return float(find_strays(points, side).sum()) <= _SPECK_SHARE * len(points)
+
+
+def find_specks(
+    voxels: MovingVoxels, labels: np.ndarray, before: tuple[np.ndarray, np.ndarray] | None
+) -> np.ndarray:
+    """(V,) bool others that hang on the thing, too small for a second one, and unknown before they did.
+
+    labels: (V,) uint8 OBJECT or OTHER;  before: as for `vote_labels`
+    Noise around a foot that lands is such, and takes the foot with it if it is handed on.
+    """
+    is_other = labels == OTHER
+    if before is not None:
+        ours, theirs = (distances_to(voxels.centers, points, _REACH * voxels.side) for points in before)
+        is_old = theirs < ours
+    else:
+        is_old = np.zeros(len(labels), bool)
+    parts, wholes = np.zeros(len(labels), np.int32), find_parts(voxels.centers, voxels.side)
+    parts[is_other] = find_parts(voxels.centers[is_other], voxels.side)
+    counts = np.bincount(parts[is_other])
+    old = np.bincount(parts[is_other & is_old], minlength=len(counts))
+    is_new = (counts < _SPECK_SHARE * (labels == OBJECT).sum()) & (old < 0.5 * counts)
+    return is_other & np.append(is_new, False)[parts] & np.isin(wholes, wholes[labels == OBJECT])
 
 
 def distances_to(points: np.ndarray, targets: np.ndarray, most: float) -> np.ndarray:
@@ -119,13 +169,15 @@ def distances_to(points: np.ndarray, targets: np.ndarray, most: float) -> np.nda
     return KDTree(targets).query(points, distance_upper_bound=most)[0]
 
 
-def _graph(voxels: MovingVoxels) -> csr_matrix:
-    """(V, V) distances of voxels that touch, both ways."""
-    num = len(voxels.centers)
-    pairs = KDTree(voxels.centers).query_pairs(_REACH * voxels.side, output_type="ndarray")
-    lengths = np.linalg.norm(voxels.centers[pairs[:, 0]] - voxels.centers[pairs[:, 1]], axis=1)
+def _graph(points: np.ndarray, side: float) -> csr_matrix:
+    """(V, V) distances of voxels that touch, both ways. points: (V, 3) centres"""
+    num = len(points)
+    if not num:
+        return csr_matrix((0, 0))
+    pairs = KDTree(points).query_pairs(_REACH * side, output_type="ndarray")
+    lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     # A length of exactly 0 would be no edge.
-    lengths = np.maximum(lengths, 1e-6 * voxels.side)
+    lengths = np.maximum(lengths, 1e-6 * side)
     half = csr_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(num, num))
     return half + half.T
 
@@ -137,7 +189,7 @@ def settle_labels(voxels: MovingVoxels, labels: np.ndarray) -> np.ndarray:
     Voxels go with the majority of those around them, a few times; unknown ones then take the label that is
     nearest along the surface. A part without any label is something else.
     """
-    graph = _graph(voxels)
+    graph = _graph(voxels.centers, voxels.side)
     # A surface fills its voxels, noise is spread over many.
     own = 2 * np.sqrt(voxels.counts)
     touching = graph.copy()

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from fourd.edit.carry import VOXEL_PX, carry_flow, carry_mark, find_rest, splat_points
+from fourd.edit.carry import VOXEL_PX, carry_flow, carry_mark, find_frame, find_rest, splat_points
 from fourd.edit.moving import find_moving, project_ideal, sample_depth, world_points
 from fourd.edit.outline import refine_outline
-from fourd.edit.plate import is_plate, plate_of
-from fourd.edit.seeds import find_strangers, hints_of_hidden, hints_of_mark, merge_hints
+from fourd.edit.plate import is_no_plate, is_plate, plate_of
+from fourd.edit.seeds import hints_of_hidden, hints_of_mark, merge_hints
 from fourd.edit.single import follow_mask
 from fourd.edit.spec import Mark
 from fourd.edit.voxels import (
@@ -18,8 +18,13 @@ from fourd.edit.voxels import (
     OBJECT,
     OTHER,
     UNKNOWN,
+    MovingVoxels,
     distances_to,
+    find_specks,
+    find_strangers,
+    find_strays,
     gather_voxels,
+    is_one_thing,
     settle_labels,
     vote_labels,
 )
@@ -139,6 +144,49 @@ def test_a_ball_before_the_marked_thing_is_another_one_and_a_leg_is_not(scale: f
     assert find_strangers(centers, parts, np.array([90.0, 60.0, 30.0])).tolist() == [False, False, True]
 
 
+def test_what_was_marked_as_one_thing_stays_one() -> None:
+    line = np.stack([np.arange(30.0), np.zeros(30), np.zeros(30)], axis=-1)
+    leg, ball = line[:12] + (32, 0, 0), line[:3] + (0, 8, 0)
+    assert not find_strays(line, 1.0).any() and not find_strays(line[:0], 1.0).any()
+    assert find_strays(np.concatenate([line, leg, ball]), 1.0).sum() == len(ball)
+    assert is_one_thing(np.concatenate([line, leg, ball[:1]]), 1.0)
+    assert not is_one_thing(np.concatenate([line, ball]), 1.0)
+
+
+@pytest.mark.parametrize("is_one", [True, False])
+def test_what_is_apart_again_is_given_back(is_one: bool) -> None:
+    hints = {cam: np.where(label(cam, 1) > 0, OBJECT, OTHER).astype(np.uint8) for cam in scene.NAMES}
+    found = find_frame(load(1), SIDE, hints, is_one=is_one)
+    assert iou(found.masks["cam01"], label("cam01", 1) == GREEN if is_one else label("cam01", 1) > 0) > 0.9
+
+
+def test_noise_that_hangs_on_the_thing_is_no_other_thing() -> None:
+    """A thing of 100 voxels, 3 others on it, 3 alone and 30 on its other end."""
+    x = np.concatenate([np.arange(100.0), [49, 50, 51], [20, 21, 22], np.full(30, 98.5)])
+    y = np.concatenate([np.zeros(100), [1, 1, 1], [9, 9, 9], 1 + np.arange(30)])
+    points = np.stack([x, y, np.zeros(len(x))], axis=-1)
+    labels = np.where(np.arange(len(x)) < 100, OBJECT, OTHER).astype(np.uint8)
+    voxels = MovingVoxels(1.0, points, np.full(len(x), 5), {})
+    assert np.flatnonzero(find_specks(voxels, labels, None)).tolist() == [100, 101, 102]
+    assert find_specks(voxels, labels, (points[:100], points[103:])).sum() == 3
+    # What was another thing before it touched this one stays so.
+    assert not find_specks(voxels, labels, (points[:40], points[100:])).any()
+
+
+def test_a_foot_of_the_grounds_own_colours_belongs_to_the_leg() -> None:
+    """Its depth is the ground's, and it shows the ground's two colours where the other one should be."""
+    checks = (np.indices((60, 60)) // 10).sum(axis=0) % 2 > 0
+    plate = np.where(checks[..., None], (150, 80, 60), (90, 70, 110)).astype(np.uint8)
+    image, truth, kind = plate.copy(), np.zeros((60, 60), bool), np.full((60, 60), OTHER, np.uint8)
+    image[5:40, 20:30], kind[5:40, 20:30], truth[5:40, 20:30] = (30, 60, 160), OBJECT, True
+    foot = np.zeros((60, 60), bool)
+    foot[40:46, 20:40] = True
+    image[foot] = np.where(checks[..., None], (90, 70, 110), (150, 80, 60)).astype(np.uint8)[foot]
+    known = np.ones((60, 60), bool)
+    mask = refine_outline(image, kind, kind == OBJECT, lambda window: (plate[window], known[window]))
+    assert mask[foot].mean() > 0.6 and iou(mask, truth | foot) > 0.85
+
+
 def test_the_rim_of_who_stands_before_the_thing_goes_by_colour() -> None:
     """The red one's depth is three pixels too wide: there the green one still shows."""
     image = np.random.default_rng(0).integers(60, 80, (60, 60, 3)).astype(np.uint8)
@@ -225,6 +273,10 @@ def test_plate_is_the_wall_behind_what_moves() -> None:
     same = is_plate(scene.see("cam01", 3)[0], rgb)
     assert same[label("cam01", 3) == 0].mean() > 0.9 and same[label("cam01", 3) > 0].mean() < 0.1
     assert is_plate((0.6 * empty).astype(np.uint8), empty).mean() > 0.99
+    other = is_no_plate(scene.see("cam01", 3)[0], rgb)
+    assert other[label("cam01", 3) > 0].mean() > 0.9 and other[label("cam01", 3) == 0].mean() < 0.05
+    assert not is_no_plate((0.6 * np.roll(empty, 1, axis=1)).astype(np.uint8), empty)[:, 2:].any()
+    assert not is_plate(np.roll(empty, 1, axis=1), empty).all()
 
 
 def shifted(num_frames: int) -> list[tuple[np.ndarray, np.ndarray]]:
