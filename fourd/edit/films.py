@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from fourd.camera import Camera
 from fourd.edit import compose, insert, shadows
 from fourd.edit.compose import Canvas
 from fourd.edit.instants import Instants
 from fourd.edit.layers import LayeredPairs
+from fourd.edit.moving import places_of
 from fourd.edit.options import EditOptions
 from fourd.edit.origin import find_origin
+from fourd.edit.outline import widen
 from fourd.edit.plate import FARTHEST, NEAREST, plate_of
-from fourd.edit.spec import INSERT, KEEP_ONLY, REMOVE, Edit
+from fourd.edit.spec import INSERT, Edit
 from fourd.errors import InputError
 from fourd.fuse.files import DisparityFiles, Progress
 from fourd.fuse.options import FuseOptions
@@ -33,8 +34,8 @@ from fourd.views import View, ViewFrame, read_view
 log = logging.getLogger(__name__)
 COLUMNS = ("frame", "changed_share", "same_time", "other_time", "inferred", "inserted", "seconds")
 _BACKGROUND = ("farthest_rgb", "farthest_valid", "median_rgb", "median_valid", "depth", "filled")
-# Frames of a chunk that tell where the light comes from.
-_LIGHT_FRAMES = 3
+# A shadow's edge is lighter than what is told to be one, px.
+_PENUMBRA_PX = 2
 # What lies nearer than an inserted thing by this share of the depth hides it.
 _SAME_DEPTH = 0.01
 # Codes of the first channel of a provenance picture.
@@ -86,7 +87,6 @@ def run(
     progress = Progress("edited frame", len(frames), time.monotonic)
     with contextlib.ExitStack() as stack:
         editor = Editor(edit, files, scene, view, (options, fuse_options, render_options), stack)
-        editor.find_light(frames)
         rows = []
         with atomic_folder(output) as folder:
             for frame in frames:
@@ -136,7 +136,8 @@ class Editor:
         self._rendered = list_frames(files.rendered) if files.rendered else {}
         self._film = stack.enter_context(contextlib.closing(open_camera(files.film))) if files.film else None
         self.times = self.instants.frames
-        self._light: np.ndarray | None = None
+        light = self._masks.meta["light"]
+        self._light = None if light is None else np.array(light)
         self._pictures: list[np.ndarray] = []
         self._place: insert.Place | None = None
         if edit.operation == INSERT and edit.pictures is not None:
@@ -220,6 +221,12 @@ class Editor:
         shadow = self._shadow(canvas, entry, things, plate, background) & ~mask
         opacity = np.maximum(self._soft(mask), self._soft(shadow))
         layer = self._layer(frame, entry, fused, static, background, opacity)
+        if not static[1].any():
+            # Nothing but other cameras at the same time shows the ground here, and they see the shadow.
+            dark = self._shadow(layer, entry, things, plate, background) & (opacity > 0)
+            shade = self._soft(widen(dark, _PENUMBRA_PX))
+            layer.image = shadows.relight(layer.image, plate[0], shade)
+            opacity = np.maximum(opacity, shade)
         canvas.lay(layer, opacity)
         return canvas
 
@@ -263,27 +270,6 @@ class Editor:
         origin = find_origin(entry.camera, static_depth, opacity > 0, sights)
         return compose.without_thing(composed, consensus, static, origin, self.times.index(entry.scene_frame))  # type: ignore[arg-type]
 
-    def find_light(self, frames: Sequence[int]) -> None:
-        """Look for the light on a few frames, if shadows are to go."""
-        if self._edit.operation not in (REMOVE, KEEP_ONLY):
-            return
-        found = []
-        for frame in frames[:: max(1, -(-len(frames) // _LIGHT_FRAMES))]:
-            entry = self._view.at(frame)
-            _, things = self._taken(entry.scene_frame)
-            background = self._background.read(frame)
-            static = self._static(entry, background)
-            plate = static if static[1].any() else (background["farthest_rgb"], background["farthest_valid"])
-            base = self._base(frame, entry)
-            dark = shadows.find_dark(base, plate[0], plate[1])
-            lit = plate[1] & ~dark
-            places = [_places(entry.camera, background["depth"], where) for where in (dark, lit)]
-            points = np.concatenate(things[:2])
-            found.append((points, *places))
-        points, dark, lit = found[len(found) // 2]
-        self._light = shadows.find_light(points, dark, lit, self._scene.up, self._side)
-        log.info("light: %s", "none found, shadows stay" if self._light is None else self._light.round(3))
-
     def _shadow(
         self, canvas: Canvas, entry: ViewFrame, things: tuple[np.ndarray, ...],
         plate: tuple[np.ndarray, ...], background: Mapping[str, np.ndarray],
@@ -292,7 +278,7 @@ class Editor:
         if self._light is None:
             return shadow
         dark = shadows.find_dark(canvas.picture(), plate[0], plate[1]) & np.isfinite(background["depth"])
-        places = _places(entry.camera, background["depth"], dark)
+        places = places_of(entry.camera, background["depth"], dark)
         shadow[dark] = shadows.shadow_of(things[0], things[1], places, self._light, self._side)
         return shadow
 
@@ -322,9 +308,3 @@ class Editor:
 
     def _soft_edge(self, mask: np.ndarray) -> np.ndarray:
         return compose.soften(mask, 0.0, self._options.feather_px)
-
-
-def _places(camera: Camera, depth: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """(N, 3) world points of chosen pixels, row by row."""
-    y, x = np.nonzero(where & np.isfinite(depth))
-    return camera.unproject(np.stack([x, y], axis=-1).astype(np.float64), depth[y, x].astype(np.float64))

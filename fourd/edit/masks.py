@@ -1,6 +1,7 @@
 """The job that carries an edit's marks to all cameras and frames: edit/{edit}/masks.npz."""
 
 import contextlib
+import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,16 +12,20 @@ from fourd.camera import Camera
 from fourd.edit.carry import VOXEL_PX, Found, Instant, carry_mark, find_rest
 from fourd.edit.instants import Instants
 from fourd.edit.mark import check_conflicts, draw_mark
+from fourd.edit.moving import places_of
 from fourd.edit.network import load_network
 from fourd.edit.options import EditOptions
 from fourd.edit.seeds import hints_of_hidden, hints_of_mark, merge_hints, surface_of
-from fourd.edit.spec import KEEP_ONLY, Edit, Mark
+from fourd.edit.shadows import find_dark, find_light
+from fourd.edit.spec import KEEP_ONLY, REMOVE, Edit, Mark
 from fourd.errors import InputError
 from fourd.io import ArchiveWriter
 from fourd.sfm.cameras import SceneCameras, read_cameras
 from fourd.views import View, read_view
 
 log = logging.getLogger(__name__)
+# Frames that tell where the light comes from.
+_LIGHT_FRAMES = 3
 
 
 def run(
@@ -48,6 +53,7 @@ def run(
         check_marked(edit.marks[0], found[frame].masks)
         for _ in range(edit.order - 1):
             found = _with_hidden(found, frame, places[0], scene, views, edit.marks[0], instants, side)
+        found = {f: without_specks(result) for f, result in found.items()}
         _warn_of_lost(edit, found)
         meta = {
             "edit": edit.name,
@@ -55,6 +61,7 @@ def run(
             "cameras": list(instants.names),
             "marked_frame": frame,
             "voxel_side": side,
+            "light": _find_light(edit, found, instants, scene.up, side),
             "frames_seen": [f for f in frames if len(found[f].points)],
         }
         with ArchiveWriter(output, meta) as writer:
@@ -128,6 +135,12 @@ def check_marked(mark: Mark, masks: Mapping[str, np.ndarray]) -> None:
         )
 
 
+def without_specks(found: Found) -> Found:
+    """Without the voxels of a thing that no camera's picture shows: noise that would edit a trajectory."""
+    is_shown = any(mask.any() for mask in found.masks.values())
+    return found if is_shown else dataclasses.replace(found, points=found.points[:0])
+
+
 def _voxel_side(instant: Instant, mark: Mark, mask: np.ndarray, camera: Camera) -> float:
     depth = instant.depths[mark.view] if mark.view in instant.depths else surface_of(instant, camera)[0]
     inside = depth[mask & np.isfinite(depth)]
@@ -162,8 +175,32 @@ def _with_hidden(
     return found
 
 
+def _find_light(
+    edit: Edit, found: Mapping[int, Found], instants: Instants, up: np.ndarray, side: float
+) -> list[float] | None:
+    """Direction towards the light, unit vector, from a few frames of all cameras, if shadows are to go."""
+    if edit.operation not in (REMOVE, KEEP_ONLY):
+        return None
+    frames = [f for f in sorted(found) if len(found[f].points)]
+    moments = []
+    for f in frames[:: max(1, -(-len(frames) // _LIGHT_FRAMES))]:
+        instant, dark, lit = instants.at(f), [], []
+        for name, image in instant.images.items():
+            camera, (height, width) = instant.cameras[name], image.shape[:2]
+            window = slice(0, height), slice(0, width)
+            plate, known, depth = instant.plate_finder(name, found[f].points)(window)
+            is_dark = find_dark(image, plate, known)
+            dark.append(places_of(camera, depth, is_dark))
+            lit.append(places_of(camera, depth, known & ~is_dark))
+        points = np.concatenate([found[f].points, found[f].others])
+        moments.append((points, np.concatenate(dark), np.concatenate(lit)))
+    light = find_light(moments, up, side)
+    log.info("light: %s", "none found, shadows stay" if light is None else light.round(3))
+    return None if light is None else light.tolist()
+
+
 def _warn_of_lost(edit: Edit, found: Mapping[int, Found]) -> None:
-    lost = sorted(f for f, result in found.items() if not any(mask.any() for mask in result.masks.values()))
+    lost = sorted(f for f, result in found.items() if not len(result.points))
     if lost:
         log.warning(
             "%s: the marked thing was found in no view at %d of %d frames (%s), so nothing is done to it "

@@ -30,6 +30,11 @@ def world_points(camera: Camera, depth: np.ndarray) -> tuple[np.ndarray, np.ndar
     return camera.unproject(pixels, depth.ravel()[index].astype(np.float64)), index
 
 
+def places_of(camera: Camera, depth: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """(N, 3) world points of chosen pixels, (H, W) bool, that have a finite depth, row by row."""
+    return world_points(camera, np.where(where, depth, np.nan))[0]
+
+
 def project_ideal(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N, 2) px and (N,) z of (N, 3) world points in an ideal pinhole; any px where z <= 0."""
     homogeneous = points @ (camera.K @ camera.R).T + camera.K @ camera.t

@@ -18,7 +18,7 @@ _SAME = 0.03
 _NOISE_LEVELS = 14.0
 # More than that beside the best light and place is something else.
 _SURE_LEVELS = 21.0
-_DARKEST_SHADOW = 0.35
+DARKEST_SHADOW = 0.35
 
 
 def plate_of(
@@ -136,5 +136,5 @@ def _smooth(*images: np.ndarray) -> tuple[np.ndarray, ...]:
 def _difference(picture: np.ndarray, ground: np.ndarray) -> np.ndarray:
     """(H, W) float32 grey levels by which a picture is off the ground in the light that fits best."""
     share = (picture * ground).sum(axis=2) / np.maximum((ground * ground).sum(axis=2), 1.0)
-    share = np.clip(share, _DARKEST_SHADOW, 1.0)[..., None]
+    share = np.clip(share, DARKEST_SHADOW, 1.0)[..., None]
     return np.abs(picture - share * ground).max(axis=2)

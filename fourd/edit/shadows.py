@@ -1,15 +1,20 @@
 """Shadows of what is taken out: where the light comes from, and what stands in its way."""
 
+from collections.abc import Sequence
+
+import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from fourd.edit.plate import is_plate
+from fourd.edit.plate import DARKEST_SHADOW, is_plate
 
 # A shadow leaves at most this share of the light.
 _DARKER = 0.88
-_NUM_DIRECTIONS, _NUM_POINTS = 400, 600
+_NUM_DIRECTIONS, _NUM_POINTS, _MIN_POINTS = 400, 600, 20
 # Least share of the dark places that the light has to explain beyond what it would darken elsewhere.
 _MIN_SCORE = 0.25
+# Blur of what is compared to give a shadow its light back, px: wider than what depth is off.
+_BLUR_PX = 2.0
 # Reach of a voxel, in its sides.
 _REACH = 1.5
 
@@ -24,30 +29,33 @@ def find_dark(image: np.ndarray, plate: np.ndarray, known: np.ndarray) -> np.nda
 
 
 def find_light(
-    points: np.ndarray, dark: np.ndarray, lit: np.ndarray, up: np.ndarray, side: float
+    moments: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], up: np.ndarray, side: float
 ) -> np.ndarray | None:
     """(3,) unit vector towards the light; None where no single direction explains the dark places.
 
-    points: (N, 3) everything that moves;  dark, lit: (D, 3), (L, 3) places that stand still, world
+    moments: (N, 3) everything that moves, and (D, 3) dark and (L, 3) lit places that stand still, world;
+    those with too few of any are left out
     up: (3,) unit;  side: of a voxel
     Directions are tried on a spiral over the upper half of the sphere, then around the best.
     """
-    points, dark, lit = (_thin(p, _NUM_POINTS * k) for p, k in ((points, 4), (dark, 1), (lit, 1)))
-    if min(len(points), len(dark), len(lit)) < 20:
-        return None
+    thin = [[_thin(p, _NUM_POINTS * k) for p, k in zip(moment, (4, 1, 1), strict=True)] for moment in moments]
+    thin = [moment for moment in thin if min(map(len, moment)) >= _MIN_POINTS]
     best, best_score = None, _MIN_SCORE
     for spread in (1.0, 0.1, 0.02):
-        center = up if best is None else best
-        for direction in _directions(center, spread, up):
-            score = float(
-                (_covered(points, dark, direction) < _REACH * side).mean()
-                - (_covered(points, lit, direction) < _REACH * side).mean()
-            )
-            if score > best_score:
-                best, best_score = direction, score
+        for direction in _directions(up if best is None else best, spread, up):
+            scores = [_score(moment, direction, _REACH * side) for moment in thin]
+            if scores and np.mean(scores) > best_score:
+                best, best_score = direction, float(np.mean(scores))
         if best is None:
             return None
     return best
+
+
+def _score(moment: Sequence[np.ndarray], direction: np.ndarray, reach: float) -> float:
+    """Share of the dark places that a direction explains, less the share of lit ones that it would darken."""
+    points, dark, lit = moment
+    shares = [float((_covered(points, places, direction) < reach).mean()) for places in (dark, lit)]
+    return shares[0] - shares[1]
 
 
 def _thin(points: np.ndarray, most: int) -> np.ndarray:
@@ -87,3 +95,15 @@ def shadow_of(
     ours = _covered(points, places, light)
     theirs = _covered(others, places, light) if len(others) else np.full(len(places), np.inf)
     return (ours < 2 * _REACH * side) & (ours <= theirs)
+
+
+def relight(image: np.ndarray, plate: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """(H, W, 3) float32 picture with as much light as the plate has, its own details kept.
+
+    image: (H, W, 3) float32 0-255;  plate: (H, W, 3) uint8;  opacity: (H, W) float32 of the shadow, 0 to 1
+    """
+    ground, dark = (
+        cv2.GaussianBlur(i.astype(np.float32), (0, 0), _BLUR_PX) for i in (plate, np.clip(image, 0, 255))
+    )
+    gain = np.clip(ground / np.maximum(dark, 1.0), 1.0, 1 / DARKEST_SHADOW)
+    return np.clip(image * (1 + opacity[..., None] * (gain - 1)), 0, 255)

@@ -23,6 +23,8 @@ _MIN_PIXELS = 3
 _ROUNDS = 3
 # Of the thing's voxels: what hangs on it and is less is no second thing.
 _SPECK_SHARE = 0.06
+# Share of a figure's size that an arm reaches from it.
+_LIMB_SHARE = 0.25
 # Votes of a colour that only the thing has, or only others have.
 _COLOUR_VOTES = 2.0
 _BITS = 20
@@ -116,23 +118,33 @@ def find_strangers(points: np.ndarray, parts: np.ndarray, counts: np.ndarray) ->
     points: (V, 3);  parts: (V,) of `find_parts`
     What a missing depth cuts off from a figure is longer than the gap.
     """
-    main = int(counts.argmax())
-    gaps = distances_to(points, points[parts == main], np.inf)
-    nearest = np.full(len(counts), np.inf)
-    low = np.full((len(counts), 3), np.inf)
-    np.minimum.at(nearest, parts, gaps)
-    np.minimum.at(low, parts, points)
-    high = np.full(low.shape, -np.inf)
-    np.maximum.at(high, parts, points)
-    return nearest > np.linalg.norm(high - low, axis=1)
+    gaps, lengths = _measure_parts(points, parts, int(counts.argmax()), len(counts))
+    return gaps > lengths
 
 
 def find_strays(points: np.ndarray, side: float) -> np.ndarray:
-    """(V,) bool points of a thing, (V, 3), that lie apart from most of it and belong to somebody else."""
+    """(V,) bool points of a thing, (V, 3), that lie apart from most of it and belong to somebody else.
+
+    They are farther away than they are long, and than a limb reaches: a hand whose arm has no depth stays.
+    """
     if not len(points):
         return np.zeros(0, bool)
     parts = find_parts(points, side)
-    return find_strangers(points, parts, np.bincount(parts))[parts]
+    counts = np.bincount(parts)
+    gaps, lengths = _measure_parts(points, parts, int(counts.argmax()), len(counts))
+    return (gaps > np.maximum(lengths, _LIMB_SHARE * lengths[counts.argmax()]))[parts]
+
+
+def _measure_parts(
+    points: np.ndarray, parts: np.ndarray, main: int, num: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(P,) distances of all parts to one of them, and (P,) diagonals of their boxes."""
+    gaps = np.full(num, np.inf)
+    np.minimum.at(gaps, parts, distances_to(points, points[parts == main], np.inf))
+    low, high = np.full((num, 3), np.inf), np.full((num, 3), -np.inf)
+    np.minimum.at(low, parts, points)
+    np.maximum.at(high, parts, points)
+    return gaps, np.linalg.norm(high - low, axis=1)
 
 
 def is_one_thing(points: np.ndarray, side: float) -> bool:

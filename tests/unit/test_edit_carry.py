@@ -149,6 +149,8 @@ def test_what_was_marked_as_one_thing_stays_one() -> None:
     leg, ball = line[:12] + (32, 0, 0), line[:3] + (0, 8, 0)
     assert not find_strays(line, 1.0).any() and not find_strays(line[:0], 1.0).any()
     assert find_strays(np.concatenate([line, leg, ball]), 1.0).sum() == len(ball)
+    # A hand's length away is a hand.
+    assert not find_strays(np.concatenate([line, ball - (0, 2, 0)]), 1.0).any()
     assert is_one_thing(np.concatenate([line, leg, ball[:1]]), 1.0)
     assert not is_one_thing(np.concatenate([line, ball]), 1.0)
 

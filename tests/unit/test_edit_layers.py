@@ -121,11 +121,45 @@ def test_light_is_found_from_shadows_and_shadows_from_the_light() -> None:
     up = np.array([0, 0, 1.0])
     ours, theirs = (shadows._covered(p, ground, light) < 0.06 for p in (thing, other))
     dark = ours | theirs
-    found = shadows.find_light(np.concatenate([thing, other]), ground[dark], ground[~dark], up, 0.06)
+    moment = np.concatenate([thing, other]), ground[dark], ground[~dark]
+    found = shadows.find_light([moment, (thing[:3], ground[dark], ground[~dark])], up, 0.06)
     assert found is not None and found @ light > np.cos(np.radians(4))
     mine = shadows.shadow_of(thing, other, ground[dark], found, 0.06)
     assert (mine == ours[dark]).mean() > 0.95
-    assert shadows.find_light(thing, ground[:10], ground, up, 0.06) is None
+    assert shadows.find_light([(thing, ground[:10], ground)], up, 0.06) is None
+    assert shadows.find_light([], up, 0.06) is None
+
+
+def test_moments_of_one_light_agree_on_it() -> None:
+    """A pole that stands in its own shadow's plane: one moment leaves the height of the sun open."""
+    light, up = np.array([0.6, 0, 0.8]), np.array([0, 0, 1.0])
+    ground = np.stack([*np.meshgrid(np.linspace(-2, 3, 90), np.linspace(-2, 3, 60))], axis=-1).reshape(-1, 2)
+    ground = np.concatenate([ground, np.zeros((len(ground), 1))], axis=1)
+    moments = []
+    for y, height in ((0.0, 1.6), (1.0, 0.9)):
+        pole = np.stack([np.zeros(200), np.full(200, y), np.linspace(0.1, height, 200)], axis=-1)
+        dark = shadows._covered(pole, ground, light) < 0.08
+        moments.append((pole, ground[dark], ground[~dark]))
+    found = shadows.find_light(moments, up, 0.08)
+    assert found is not None and found @ light > np.cos(np.radians(4))
+
+
+def test_a_shadow_gets_its_light_back_and_keeps_the_details() -> None:
+    rng = np.random.default_rng(5)
+    plate = np.full((40, 60, 3), (160, 140, 110), np.uint8)
+    grain = rng.normal(1, 0.04, (40, 60, 1))
+    lit = plate * grain
+    dark = lit.copy()
+    dark[10:30, 15:45] *= 0.55
+    opacity = np.zeros((40, 60), np.float32)
+    opacity[8:32, 13:47] = 1
+    relit = shadows.relight(dark.astype(np.float32), plate, opacity)
+    inner = (slice(14, 26), slice(19, 41))
+    assert np.abs(relit[inner] / lit[inner] - 1).mean() < 0.02
+    assert np.corrcoef(relit[inner].ravel(), lit[inner].ravel())[0, 1] > 0.95
+    assert (relit[opacity == 0] == np.clip(dark[opacity == 0].astype(np.float32), 0, 255)).all()
+    # The ground is not darkened, whatever the plate says.
+    assert (shadows.relight(dark.astype(np.float32), plate // 2, opacity) >= dark - 1e-3).all()
 
 
 def test_darker_places_of_the_plate_are_dark() -> None:
