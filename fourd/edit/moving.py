@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fourd.camera import Camera
+from fourd.edit.sample_kernels import look_up
 
 # Standard deviation from a median absolute difference of two equally noisy values.
 _SIGMA_PER_MEDIAN = 1.4826 / np.sqrt(2)
@@ -47,13 +48,9 @@ def sample_depth(camera: Camera, depth: np.ndarray, points: np.ndarray) -> tuple
 
     Returns (N,) float32 z of the nearest pixel, NaN outside the picture or where unknown, and (N,) z.
     """
-    pixels, z = project_ideal(camera, points)
-    height, width = depth.shape
-    x, y = pixels[:, 0], pixels[:, 1]
-    inside = (z > 0) & (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-    seen = np.full(len(points), np.nan, np.float32)
-    at = np.rint(pixels[inside]).astype(np.int64)
-    seen[inside] = depth[at[:, 1], at[:, 0]]
+    seen, z = np.empty(len(points), np.float32), np.empty(len(points))
+    image_from_world, offset = camera.K @ camera.R, camera.K @ camera.t
+    look_up(np.ascontiguousarray(points), image_from_world, offset, np.ascontiguousarray(depth), seen, z)
     return seen, z
 
 
