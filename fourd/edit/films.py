@@ -81,7 +81,7 @@ def run(
     scene, view = read_cameras(files.cameras), read_view(files.view)
     if view.name in scene.left_out or view.role == "left_out":
         raise InputError(
-            f"edit {edit.name}: view {view.name} was left out of the calibration "
+            f"view {view.name} was left out of the calibration "
             f"({scene.left_out.get(view.name, view.status)}), so it cannot be edited: choose another view"
         )
     progress = Progress("edited frame", len(frames), time.monotonic)

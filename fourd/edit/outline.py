@@ -67,6 +67,8 @@ def refine_outline(
     trimap[part > 0] = cv2.GC_PR_FGD
     trimap[(core & ~same) | sure] = cv2.GC_FGD
     trimap[edge & same] = cv2.GC_PR_BGD
+    # Deep inside depth alone decides: dark hair looks like a wall in the shadow.
+    trimap[(part > 0) & ~edge] = cv2.GC_FGD
     if not (trimap == cv2.GC_BGD).any() or not (trimap == cv2.GC_FGD).any():
         return inside > 0
     models = np.zeros((1, 65)), np.zeros((1, 65))

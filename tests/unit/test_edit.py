@@ -10,7 +10,9 @@ import pytest
 import yaml
 
 from fourd.edit.__main__ import main
+from fourd.edit.carry import Found
 from fourd.edit.mark import check_conflicts, draw_mark, read_mask
+from fourd.edit.masks import check_marked, without_specks
 from fourd.edit.spec import Mark, load_edits, read_edit
 from fourd.errors import InputError
 
@@ -131,6 +133,26 @@ def test_marks_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(InputError, match="contradict each other on 4 px"):
         check_conflicts(marks, masks)
     check_conflicts([marks[0], Mark("d", 0, "box", marks[1].points, is_part=False)], masks)
+
+
+def test_a_mark_of_which_nothing_is_left_is_refused() -> None:
+    nothing, something = np.zeros((4, 6), bool), np.eye(4, 6, dtype=bool)
+    with pytest.raises(InputError, match="the box on frame 2 of cam01: .* mark the thing closer"):
+        check_marked(Mark("cam01", 2, "box"), {"cam00": something, "cam01": nothing})
+    check_marked(Mark("cam01", 2, "box"), {"cam00": nothing, "cam01": something})
+    # A film of a trajectory has no mask of its own.
+    check_marked(Mark("hold_view", 2, "box"), {"cam00": nothing, "cam01": something})
+    with pytest.raises(InputError, match="frame 2 of hold_view"):
+        check_marked(Mark("hold_view", 2, "box"), {"cam00": nothing, "cam01": nothing})
+
+
+def test_voxels_that_no_picture_shows_are_noise() -> None:
+    def found(mask: np.ndarray) -> Found:
+        return Found({"cam00": mask}, {}, np.ones((3, 3)), np.ones((5, 3)), np.ones((7, 3)))
+
+    nothing = without_specks(found(np.zeros((4, 6), bool)))
+    assert (len(nothing.points), len(nothing.others), len(nothing.still)) == (0, 5, 7)
+    assert len(without_specks(found(np.eye(4, 6, dtype=bool))).points) == 3
 
 
 def png(path: Path, image: np.ndarray) -> Path:
