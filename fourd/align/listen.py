@@ -14,7 +14,7 @@ from fourd.align.audio_delay import SoundMatch, estimate_audio_delay
 from fourd.align.clock import CameraClock, Offsets, PairDelay
 from fourd.align.clock_graph import attach_clock, solve_clocks
 from fourd.align.options import AlignOptions
-from fourd.align.sampling import choose_start
+from fourd.align.sampling import TOO_SHORT, choose_start, find_too_short
 from fourd.align.sound import Sound, check_sound, prepare_sound
 from fourd.audio import read_audio
 from fourd.errors import InputError
@@ -105,14 +105,15 @@ def solve_by_sound(
     clocks = {name: CameraClock(0.0, 0.0, 0.0, 0.0, "audio", status[name]) for name in (*inputs, *heldout)}
     notes = [f"{name}: {clock.status}" for name, clock in clocks.items() if clock.status != "ok"]
     able = [name for name in inputs if status[name] == "ok"]
-    reference = inputs[0]
+    # Sight may place what has no sound, but not a film that nobody looks at.
+    reference = next((name for name in inputs if not status[name].startswith(TOO_SHORT)), inputs[0])
     if able:
         solved, more = solve_clocks(able, pairs, able[0])
         clocks |= solved
         reference = next((name for name in able if solved[name].method == "reference"), reference)
         notes += more
         if able[0] != inputs[0]:
-            notes.append(f"times are relative to {reference}: {inputs[0]} has no sound to compare")
+            notes.append(f"times are relative to {reference}: {inputs[0]} cannot be compared")
     fixed = {name: clocks[name] for name in inputs}
     for name in heldout:
         if status[name] == "ok":
@@ -140,21 +141,24 @@ def run_listen(
     ingest_paths: ingest/{cam}.json of all cameras, in the scene's order;  fps, num_frames: of the scene
     start_s: common time of scene frame 0 where the scene says it; otherwise the earliest from which all
     placed inputs film, None where there is none
+    A film that is too short for the scene is not listened to.
     Raises InputError for a camera without an ingest file and for a film that cannot be read.
     """
+    names = (*inputs, *heldout)
     documents = {read_ingest(path)["camera"]: path for path in ingest_paths}
-    missing = [name for name in (*inputs, *heldout) if name not in documents]
+    missing = [name for name in names if name not in documents]
     if missing:
         raise InputError(
             f"expected ingest files of all cameras, got none of {', '.join(missing)}: name them all"
         )
-    sounds, status = read_sounds([documents[name] for name in (*inputs, *heldout)])
+    pts = {name: np.asarray(read_ingest(documents[name])["pts_s"], dtype=np.float64) for name in names}
+    too_short = find_too_short(pts, inputs, fps, num_frames)
+    sounds, status = read_sounds([documents[name] for name in names if name not in too_short])
     matches = compare_sounds(sounds, inputs, heldout, options)
-    offsets = solve_by_sound([match.delay for match in matches], status, inputs, heldout)
+    offsets = solve_by_sound([match.delay for match in matches], status | too_short, inputs, heldout)
     placed = {name: offsets.clocks[name] for name in inputs if offsets.clocks[name].status == "ok"}
     if start_s is not None or len(placed) < 2:
         return dataclasses.replace(offsets, start_s=start_s), matches
-    pts = {name: np.asarray(read_ingest(documents[name])["pts_s"], dtype=np.float64) for name in placed}
     try:
         start_s = choose_start(placed, pts, fps, num_frames)
     except InputError as error:

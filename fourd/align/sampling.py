@@ -3,13 +3,15 @@
 Times are seconds on the common clock; scene frame k is at start_s + k / fps.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from fourd.align.clock import CameraClock
 from fourd.errors import InputError
 
+# How the status of a film begins that ends before half of the scene is over: nobody looks at it any further.
+TOO_SHORT = "too short for the scene"
 # Of two frames that are equally near, take the earlier, whatever the last bits of their times say.
 _TIE_S = 1e-6
 # Sub-frame phases that are tried, and how often the best one's surroundings are tried again.
@@ -68,6 +70,30 @@ def check_coverage(
     )
 
 
+def find_too_short(
+    pts_by_camera: Mapping[str, np.ndarray], inputs: Sequence[str], fps: float, num_frames: int
+) -> dict[str, str]:
+    """Cameras whose film shows less than half of the scene, such as a mistaken tap, and the reason.
+
+    pts_by_camera: (N,) times of the film's frames on its own clock, s;  inputs: cameras not held out
+    Where half of the inputs are so short it is num_frames that is wrong, and none is named.
+    """
+    reasons = {}
+    for name, pts_s in pts_by_camera.items():
+        fitting = _count_fitting(float(pts_s[-1] - pts_s[0]), fps)
+        if 2 * fitting < num_frames:
+            reasons[name] = (
+                f"{TOO_SHORT}: it lasts {fitting} of {num_frames} frames at {fps:g} fps; film longer, or "
+                "take it out of the scene"
+            )
+    return reasons if 2 * len(reasons.keys() & set(inputs)) < len(inputs) else {}
+
+
+def _count_fitting(duration_s: float, fps: float) -> int:
+    """Scene frames from the first to the last picture, both included."""
+    return int(np.floor(duration_s * fps + 1e-6)) + 1
+
+
 def choose_start(
     clocks: Mapping[str, CameraClock], pts_by_camera: Mapping[str, np.ndarray], fps: float, num_frames: int
 ) -> float:
@@ -88,7 +114,7 @@ def choose_start(
     last_to_start = max(common, key=lambda name: float(common[name][0]))
     first_to_end = min(common, key=lambda name: float(common[name][-1]))
     earliest, latest = float(common[last_to_start][0]), float(common[first_to_end][-1])
-    fitting = int(np.floor((latest - earliest) * fps + 1e-6)) + 1 if latest >= earliest else 0
+    fitting = _count_fitting(latest - earliest, fps) if latest >= earliest else 0
     if fitting < num_frames:
         raise InputError(
             f"expected all cameras to have filmed {num_frames} frames at {fps:g} fps together, but between "

@@ -19,6 +19,7 @@ from fourd.align.listen import SAME_RECORDING, TRAVEL_SIGMA_S
 from fourd.align.motion_maps import MotionMaps
 from fourd.align.moving_tracks import MovingTracks
 from fourd.align.request import ClockRequest
+from fourd.align.sampling import TOO_SHORT
 from fourd.align.spatiotemporal import refine_clocks
 from fourd.align.spatiotemporal_options import SpatiotemporalOptions
 from fourd.align.track_groups import join_observations
@@ -46,11 +47,12 @@ def needs_vision(audio: Offsets, request: ClockRequest, options: VisionOptions) 
         return ""
     if options.use == "always":
         return "align_vision.use is `always`"
-    silent = [name for name in request.names if audio.clocks[name].status != "ok"]
+    looked_at = [name for name in request.names if not audio.clocks[name].status.startswith(TOO_SHORT)]
+    silent = [name for name in looked_at if audio.clocks[name].status != "ok"]
     if silent:
         return f"sound does not place {', '.join(silent)}"
     limit_s = options.max_sound_sigma_frames / request.fps
-    doubtful = [name for name in request.names if audio.clocks[name].sigma_s > limit_s]
+    doubtful = [name for name in looked_at if audio.clocks[name].sigma_s > limit_s]
     return f"sound leaves doubt about {', '.join(doubtful)}" if doubtful else ""
 
 
@@ -228,8 +230,8 @@ def solve_all(
     motions: by camera; not used where sound suffices
     """
     heard = sound_pairs(audio, films)
-    copies = {n for n, clock in audio.clocks.items() if clock.status.startswith(SAME_RECORDING)}
-    inputs = [name for name in request.inputs if name not in copies]
+    given_up = {n for n, c in audio.clocks.items() if c.status.startswith((SAME_RECORDING, TOO_SHORT))}
+    inputs = [name for name in request.inputs if name not in given_up]
     reason = needs_vision(audio, request, vision)
     notes = [*audio.notes, f"sight is used: {reason}" if reason else "sight is not used: sound suffices"]
     seen: list[VisualMatch | EpipolarMatch] = []
@@ -245,9 +247,9 @@ def solve_all(
         clocks, more = refine_jointly(clocks, reference, seen, motions, films.cameras, spatiotemporal)
         notes += more
     fixed = dict(clocks)
-    clocks |= {name: audio.clocks[name] for name in copies}
+    clocks |= {name: audio.clocks[name] for name in given_up}
     for name in request.heldout:
-        if name in copies:
+        if name in given_up:
             continue
         against: list[VisualMatch | EpipolarMatch] = []
         if reason:

@@ -58,8 +58,7 @@ def triangulate_inputs(
 
 
 def run_import(
-    calibrations: Sequence[Path],
-    calibration_format: str,
+    imported: Sequence[ImportedCameras],
     names_in_file: Mapping[str, str],
     heldout: Sequence[str],
     film_paths: Mapping[str, Path],
@@ -70,6 +69,7 @@ def run_import(
 ) -> tuple[SceneCameras, np.ndarray]:
     """Cameras of the scene and (N, 3) sparse points, from files.
 
+    imported: what the calibration files hold
     names_in_file: camera -> its name in the calibration, in the scene's order
     depth_range: (near, far) in the calibration's units, or None to estimate
     Raises InputError for every input that does not fit.
@@ -78,8 +78,6 @@ def run_import(
     missing = [name for name in names_in_file if name not in film_paths]
     if missing:
         raise InputError(f"expected a file of align for every camera, got none for {', '.join(missing)}")
-    imported = [read_calibration(path, calibration_format) for path in calibrations]
-    _log_imports(imported)
     ingested = {name: read_ingested(film_paths[name]) for name in names_in_file}
     left_out = find_left_out(imported, names_in_file, ingested)
     names_in_file = {name: given for name, given in names_in_file.items() if name not in left_out}
@@ -112,11 +110,13 @@ def run_import(
     return scene, points
 
 
-def _log_imports(calibrations: Sequence[ImportedCameras]) -> None:
-    for calibration in calibrations:
+def _read_calibrations(args: argparse.Namespace) -> list[ImportedCameras]:
+    imported = [read_calibration(path, args.calibration_format) for path in args.calibration]
+    for calibration in imported:
         log.info("%s: %d cameras", calibration.path, len(calibration.cameras))
         for note in calibration.notes:
             log.info("%s: %s", calibration.path, note)
+    return imported
 
 
 def _log_ranges(ranges: Mapping[str, DepthRange], num_points: int, scale: float) -> None:
@@ -252,7 +252,8 @@ def _main_recover(args: argparse.Namespace) -> None:
         args.heldout,
         args.audio,
         args.start_s,
-        args.num_frames / args.fps,
+        args.fps,
+        args.num_frames,
         parse_scale_hint(args.scale_hint),
         args.output,
         options_from_args(RecoverOptions, args),
@@ -262,10 +263,8 @@ def _main_recover(args: argparse.Namespace) -> None:
 def _main_films(args: argparse.Namespace) -> None:
     names = parse_camera_names(args.camera)
     split_cameras(list(names), args.heldout)
-    imported = [read_calibration(path, args.calibration_format) for path in args.calibration]
-    _log_imports(imported)
     paths = dict(zip(names, _paths_of(list(names), args.ingest), strict=True))
-    write_film_cameras(args.output, film_cameras_of(imported, names, args.heldout, paths))
+    write_film_cameras(args.output, film_cameras_of(_read_calibrations(args), names, args.heldout, paths))
 
 
 def _paths_of(names: Sequence[str], paths: Sequence[Path]) -> list[Path]:
@@ -278,8 +277,7 @@ def _paths_of(names: Sequence[str], paths: Sequence[Path]) -> list[Path]:
 
 def _main_import(args: argparse.Namespace) -> None:
     scene, points = run_import(
-        args.calibration,
-        args.calibration_format,
+        _read_calibrations(args),
         parse_camera_names(args.camera),
         args.heldout,
         {path.stem: path for path in args.films},

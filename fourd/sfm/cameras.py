@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from fourd.camera import CameraTrack, tracks_from_dict, tracks_to_dict
-from fourd.errors import InputError, explain_faults
-from fourd.io import SCHEMA_VERSION, read_json, write_json
+from fourd.errors import explain_faults
+from fourd.io import read_document, write_json
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,12 +54,7 @@ def write_cameras(path: Path | str, scene: SceneCameras) -> None:
 
 def read_cameras(path: Path | str) -> SceneCameras:
     """Read cameras.json; every camera is checked. Raises InputError, naming the file."""
-    document = read_json(path)
-    if document.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(
-            f"{path}: expected schema_version {SCHEMA_VERSION}, got {document.get('schema_version')}: "
-            "delete the file and run again"
-        )
+    document = read_document(path)
     with explain_faults(f"cameras.json of this workflow in {path}"):
         scene = SceneCameras(
             fps=float(document["fps"]),

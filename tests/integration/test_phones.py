@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from fourd.align.clock import read_offsets
+from fourd.audio import read_audio
 from fourd.camera import camera_from_dict
 from fourd.demo.options import DemoOptions, camera_names
 from fourd.demo.phones import SAMPLE_RATE, write_phone_file
@@ -34,6 +35,7 @@ BAD = {
     "other": "sound",
     "copy": "same recording as cam00",
     "single": "",
+    "tap": "too short for the scene",
     "covered": "",
 }
 
@@ -66,12 +68,16 @@ def write_bad_films(folder: Path) -> None:
     write_film(folder / "other.mp4", noise, 0.2 * rng.standard_normal(SAMPLE_RATE))
     shutil.copy(folder / "cam00.mp4", folder / "copy.mp4")
     write_film(folder / "single.mp4", pictures[:1])
+    # A mistaken tap, whose sound went on long enough to be placed.
+    sound = read_audio(folder / "cam01.mp4")
+    assert sound is not None and sound.sample_rate == SAMPLE_RATE
+    write_film(folder / "tap.mp4", pictures[:3], sound.samples)
     write_film(folder / "covered.mp4", [np.full_like(pictures[0], 12)] * 20, np.zeros(SAMPLE_RATE))
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """Five phones and four films that cannot be used, as far as the cameras of the scene."""
+    """Five phones and five films that cannot be used, as far as the cameras of the scene."""
     workspace = Workspace(tmp_path_factory.mktemp("phones"))
     films = workspace.folder / "films"
     films.mkdir()

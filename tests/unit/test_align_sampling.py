@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fourd.align.clock import CameraClock
-from fourd.align.sampling import check_coverage, choose_start, match_frames
+from fourd.align.sampling import TOO_SHORT, check_coverage, choose_start, find_too_short, match_frames
 from fourd.errors import InputError
 
 
@@ -71,6 +71,28 @@ def test_whole_coverage_is_ok():
 def test_what_is_missing_is_said(common_s, num_frames, reason):
     found = coverage(common_s, num_frames)
     assert found.startswith("camera cam03: ") and re.search(reason, found), found
+
+
+def test_a_mistaken_tap_is_too_short_for_the_scene():
+    films = {"a": film(60), "tap": film(3), "b": film(90), "one": film(1), "c": film(30), "last": film(2)}
+    inputs = ["a", "tap", "b", "one", "c"]
+    found = find_too_short(films, inputs, 30, 60)
+    assert list(found) == ["tap", "one", "last"]
+    assert found["tap"].startswith(f"{TOO_SHORT}: it lasts 3 of 60 frames at 30 fps")
+    # A film that a held-out camera made says nothing about the others.
+    assert list(find_too_short(films | {"last": film(60)}, inputs, 30, 60)) == ["tap", "one"]
+
+
+@pytest.mark.parametrize(("fps", "num_frames"), [(30, 7), (24, 5), (60, 13)])
+def test_half_of_the_scene_is_not_too_short(fps, num_frames):
+    assert find_too_short({"a": film(), "b": film(), "c": film(4)}, ["a", "b", "c"], fps, num_frames) == {}
+    assert "c" in find_too_short({"a": film(), "b": film(), "c": film(2)}, ["a", "b", "c"], fps, num_frames)
+
+
+def test_where_half_of_the_films_are_short_the_scene_is_too_long():
+    films = {"a": film(60), "b": film(3), "c": film(60), "d": film(4)}
+    assert find_too_short(films, list(films), 30, 60) == {}
+    assert find_too_short(dict.fromkeys("abc", film(60)), list("abc"), 30, 600) == {}
 
 
 def clocks_of(*offsets_s: float, **bad: str) -> dict[str, CameraClock]:

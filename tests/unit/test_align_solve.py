@@ -1,8 +1,16 @@
 import dataclasses
 import itertools
 
-from fourd.align.clock import PairDelay
-from fourd.align.solve import merge_pairs
+import numpy as np
+import pytest
+
+from fourd.align.clock import CameraClock, Offsets, PairDelay
+from fourd.align.request import ClockRequest
+from fourd.align.sampling import TOO_SHORT
+from fourd.align.solve import merge_pairs, needs_vision, solve_all
+from fourd.align.spatiotemporal_options import SpatiotemporalOptions
+from fourd.align.vision_options import VisionOptions
+from fourd.film_cameras import FilmCameras
 
 NAMES = ("a", "b", "c", "d", "e")
 
@@ -56,3 +64,18 @@ def test_a_pair_that_nothing_checks_is_taken_from_sight() -> None:
         [pair_of("a", "b", {}, "audio")], [pair_of("a", "b", {"b": 0.1}, "vision")]
     )
     assert merged.delay_s == 0.1 and len(notes) == 1
+
+
+@pytest.mark.parametrize("heldout", [(), ("tap",)])
+def test_nobody_looks_at_a_film_that_is_too_short(heldout: tuple[str, ...]) -> None:
+    clocks = {name: CameraClock(0.0, sigma_s=1e-4, method="audio") for name in NAMES}
+    clocks["tap"] = CameraClock(0.0, score=0.0, method="audio", status=f"{TOO_SHORT}: it lasts 3 frames")
+    request = ClockRequest(("tap", *NAMES), heldout)
+    audio = Offsets("a", clocks, None, tuple(all_pairs({}, "audio")))
+    vision = VisionOptions()
+    assert needs_vision(audio, request, vision) == ""
+    found = solve_all(
+        request, audio, FilmCameras({}, np.zeros((0, 3))), {}, vision, SpatiotemporalOptions()
+    ).offsets
+    assert found.clocks["tap"] == clocks["tap"] and list(found.clocks) == ["tap", *NAMES]
+    assert all(found.clocks[name].status == "ok" for name in NAMES)

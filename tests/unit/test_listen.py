@@ -18,6 +18,7 @@ from fourd.align.listen import (
     solve_by_sound,
 )
 from fourd.align.options import AlignOptions
+from fourd.align.sampling import TOO_SHORT
 from fourd.demo.options import DemoOptions
 from fourd.demo.truth import describe_phones
 from fourd.errors import InputError
@@ -140,6 +141,37 @@ def test_reference_without_sound_is_replaced_and_said(films: dict[str, Path]) ->
     assert offsets.reference == "cam01"
     assert offsets.clocks["cam02"].offset_s == pytest.approx(-1.32, abs=2e-4)
     assert any("relative to cam01" in note and "mute" in note for note in offsets.notes)
+
+
+@pytest.fixture(scope="module")
+def tap(films: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A film of three pictures, with enough sound to be placed."""
+    path = tmp_path_factory.mktemp("tap") / "tap.json"
+    document = json.loads(films["dubbed"].read_text())
+    times = {"num_source_frames": 3, "pts_s": [0.0, 1 / FPS, 2 / FPS], "sha256": "another"}
+    path.write_text(json.dumps(document | {"camera": "tap"} | times))
+    return path
+
+
+def test_film_of_three_frames_is_left_out_and_the_scene_begins_as_without(
+    films: dict[str, Path], tap: Path
+) -> None:
+    inputs = ["cam00", "cam01", "cam02"]
+    without = listen(films, inputs, ["cam03"])
+    for some in (["tap", *inputs], [*inputs, "tap"]):
+        found = listen(films | {"tap": tap}, some, ["cam03"])
+        assert found.clocks["tap"].status.startswith(TOO_SHORT)
+        assert {name: found.clocks[name] for name in STARTS} == dict(without.clocks)
+        assert (found.start_s, found.reference) == (without.start_s, "cam00")
+    held_out = listen(films | {"tap": tap}, inputs, ["cam03", "tap"])
+    assert held_out.clocks["tap"].status.startswith(TOO_SHORT) and held_out.start_s == without.start_s
+
+
+def test_film_of_three_frames_is_no_reference_where_nobody_has_sound(
+    films: dict[str, Path], tap: Path
+) -> None:
+    offsets = listen(films | {"tap": tap}, ["tap", "mute", "silent"], [])
+    assert offsets.reference == "mute"
 
 
 def test_no_camera_can_be_placed(films: dict[str, Path]) -> None:

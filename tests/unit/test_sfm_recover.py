@@ -6,10 +6,11 @@ import pytest
 import yaml
 
 from fourd.align.clock import CameraClock, Offsets
+from fourd.align.sampling import TOO_SHORT
 from fourd.errors import InputError
 from fourd.film_cameras import FilmCameras, read_film_cameras, write_film_cameras
 from fourd.ingest.__main__ import main as ingest_main
-from fourd.io import write_png
+from fourd.io import read_json, write_json, write_png
 from fourd.sfm.__main__ import main, parse_scale_hint
 from fourd.sfm.compare import align_similarity
 from fourd.sfm.recover.films import focal_guess_px, select_frames
@@ -116,11 +117,17 @@ def test_the_command_line_repeats_the_bytes_with_a_scale_hint_in_words(drawn, re
 
 
 def test_the_command_line_without_a_scale_hint(ingested, tmp_path):
-    names = ["cam01", "cam02"]
-    main(recover_arguments(ingested, names, tmp_path / "pair.json", "--scale-hint=none", "--start-s=none"))
+    names = ["cam00", "cam01", "cam02"]
+    # A film that is too short for the scene is not looked at.
+    document = read_json(ingested["cam00"])
+    short = {key: document[key][:2] for key in ("pts_s", "files")} | {"num_source_frames": 2}
+    write_json(tmp_path / "cam00.json", document | short)
+    paths, flags = ingested | {"cam00": tmp_path / "cam00.json"}, ["--scale-hint=none", "--start-s=none"]
+    main(recover_arguments(paths, names, tmp_path / "pair.json", *flags))
     found = read_film_cameras(tmp_path / "pair.json")
     assert found.metres_per_unit is None
-    assert [found.cameras[name].status for name in names] == ["ok", "ok"]
+    assert found.cameras["cam00"].status.startswith(f"{TOO_SHORT}: it lasts 2 of 5 frames")
+    assert [found.cameras[name].status for name in names[1:]] == ["ok", "ok"]
 
 
 def test_a_scale_hint_needs_cameras_that_were_placed(drawn):
