@@ -18,7 +18,7 @@ import numpy as np
 from fourd.camera import Camera, camera_from_dict
 from fourd.cli import run_stage
 from fourd.errors import InputError, explain_faults
-from fourd.io import SCHEMA_VERSION, read_json, write_json
+from fourd.io import MAX_IMAGE_SIDE_PX, read_document, write_json
 from fourd.sfm.cameras import SceneCameras, read_cameras
 from fourd.trajectory import TrajectorySpec, scene_frames, trajectory_from_mapping
 
@@ -127,7 +127,7 @@ def virtual_view(scene: SceneCameras, name: str, spec: TrajectorySpec, size: tup
         raise InputError(f"trajectory {name}: a camera has this name already: choose another")
     size = scene.tracks[scene.inputs[0]].size if size is None else size
     # SciPy takes 0.3 s to import, and most readers of views place none.
-    from fourd.paths.presets import place_cameras
+    from fourd.trajectory.presets import place_cameras
 
     shown = scene_frames(spec, scene.num_frames)
     cameras = place_cameras(spec, scene, size)
@@ -148,15 +148,10 @@ def write_view(path: Path | str, view: View) -> None:
 
 def read_view(path: Path | str) -> View:
     """Read views/{view}.json; the name is the file's. Raises InputError, naming the file."""
-    document = read_json(path)
-    if document.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(
-            f"{path}: expected schema_version {SCHEMA_VERSION}, got {document.get('schema_version')}: "
-            "delete the file and run again"
-        )
+    document = read_document(path)
     with explain_faults(f"a view of this workflow in {path}"):
         size = (int(document["size"][0]), int(document["size"][1]))
-        if document["role"] not in ROLES or min(size) < 1:
+        if document["role"] not in ROLES or not 1 <= min(size) <= max(size) <= MAX_IMAGE_SIDE_PX:
             raise ValueError(f"role {document['role']!r}, size {size}")
         entries = tuple(
             _read_entry(entry, size, f"{path}, frame {i}") for i, entry in enumerate(document["frames"])

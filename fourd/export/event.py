@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fourd.arc_path import average_track
 from fourd.camera import Camera, CameraTrack
 from fourd.errors import InputError
 from fourd.export import ExportOptions
 from fourd.io import Archive, read_image
 from fourd.sfm.cameras import SceneCameras
+from fourd.trajectory.arc_path import average_track
 from fourd.views import physical_view
 
 

@@ -1,6 +1,5 @@
 """One GLB with the cameras and the points of every frame, animated: opens in any viewer of glTF 2.0."""
 
-import json
 import struct
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fourd.export.event import Event
-from fourd.io import atomic_path
+from fourd.io import atomic_path, json_text
 from fourd.sfm.importers.nerfstudio import OPENCV_FROM_OPENGL
 
 FLOAT, USHORT = 5126, 5123
@@ -73,7 +72,7 @@ class GlbWriter:
         if not self.document["animations"][0]["channels"]:
             document.pop("animations")
         document["buffers"] = [{"byteLength": self._length}]
-        text = json.dumps(document, allow_nan=False).encode()
+        text = json_text(document, path).encode()
         text += b" " * (-len(text) % 4)
         body = b"".join(self._chunks)
         total = 12 + 8 + len(text) + 8 + len(body)

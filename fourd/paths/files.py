@@ -8,7 +8,6 @@ path files of ours know which scene frame is shown.
 
 import csv
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from fourd.camera import Camera, check_camera
 from fourd.errors import InputError
-from fourd.io import atomic_folder, read_csv, read_json, write_csv, write_json, write_text
-from fourd.paths.presets import focal_of_fov, fov_of_focal, place_cameras
-from fourd.paths.timing import film_shares
+from fourd.io import atomic_folder, json_text, read_csv, read_json, write_csv, write_json, write_text
 from fourd.sfm.cameras import SceneCameras
 from fourd.sfm.importers.colmap import PIXEL_CENTER, read_colmap
 from fourd.sfm.importers.nerfstudio import OPENCV_FROM_OPENGL
 from fourd.trajectory import read_path_file, scene_frames, trajectory_from_mapping
+from fourd.trajectory.presets import focal_of_fov, fov_of_focal, place_cameras
+from fourd.trajectory.timing import film_shares
 from fourd.views import View
 
 FORMATS = ("path", "nerfstudio", "colmap", "csv")
@@ -160,7 +159,7 @@ def _write_nerfstudio(path: Path, film: Film) -> None:
         "keyframes": [],
         "camera_path": entries,
     }
-    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    write_text(path, json_text(document, path, indent=1) + "\n")
 
 
 def _read_nerfstudio(path: Path, fps: float) -> Film:

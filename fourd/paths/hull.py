@@ -31,9 +31,9 @@ def distance_to_hull(point: np.ndarray, corners: np.ndarray) -> float:
 
 
 def camera_spacing(centers: np.ndarray) -> float:
-    """Median distance of a camera (N, 3) to its nearest neighbour."""
+    """Median distance of a camera (N, 3) to the nearest at another place; infinite if there is none."""
     gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
-    return float(np.median(np.min(gaps + np.diag(np.full(len(centers), np.inf)), axis=1)))
+    return float(np.median(np.min(np.where(gaps > 0, gaps, np.inf), axis=1)))
 
 
 def describe_view(camera: Camera, inputs: Sequence[Camera]) -> dict[str, Any]:

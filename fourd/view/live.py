@@ -21,9 +21,9 @@ from fourd.fuse import FuseOptions
 from fourd.fuse.files import DisparityFiles, Pictures, Progress, Silhouettes, hull_depth_range
 from fourd.fuse.hull import HullOptions
 from fourd.fuse.view import fuse_view
-from fourd.paths.presets import place_cameras
 from fourd.sfm.cameras import read_cameras
 from fourd.trajectory import TrajectorySpec
+from fourd.trajectory.presets import place_cameras
 from fourd.viewer.lattice import fit_width
 
 # Backgrounds of so many places are kept: turning back to one is quick.

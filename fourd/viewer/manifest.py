@@ -10,9 +10,9 @@ import numpy as np
 from fourd.camera import Camera, CameraTrack
 from fourd.io import SCHEMA_VERSION, Archive
 from fourd.paths.hull import describe_view
-from fourd.paths.presets import place_cameras
 from fourd.sfm.cameras import SceneCameras
 from fourd.trajectory import TrajectorySpec
+from fourd.trajectory.presets import place_cameras
 from fourd.viewer.lattice import REAL_SHARE
 from fourd.views import View
 

@@ -11,8 +11,8 @@ import pytest
 
 from fourd.camera import Camera
 from fourd.config import SCHEMA_FOLDER, load_yaml, validate
-from fourd.paths.presets import place_cameras
 from fourd.trajectory import scene_frames, trajectory_from_mapping
+from fourd.trajectory.presets import place_cameras
 from fourd.viewer.__main__ import main
 from tests.unit import viewer_scene
 from tests.unit.viewer_scene import FRAMES, NUM_FRAMES, NUM_VIEWS, SIZE, cross_fade, psnr_db

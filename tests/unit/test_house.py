@@ -1,6 +1,8 @@
 """Rules of the house that a machine can check."""
 
 import ast
+import graphlib
+import itertools
 import re
 import subprocess
 import tomllib
@@ -24,7 +26,8 @@ def tracked(*patterns: str) -> list[Path]:
         text=True,
         check=True,
     ).stdout.split()
-    return [REPOSITORY / name for name in names]
+    # What is removed but not yet committed is still in the list.
+    return [path for path in (REPOSITORY / name for name in names) if path.exists()]
 
 
 def test_files_and_functions_are_small() -> None:
@@ -35,6 +38,44 @@ def test_files_and_functions_are_small() -> None:
             if isinstance(node, ast.FunctionDef):
                 lines = (node.end_lineno or 0) - node.lineno + 1
                 assert lines <= MAX_FUNCTION_LINES, f"{path}: {node.name} has {lines} lines"
+
+
+def imports_among(paths: list[Path]) -> dict[str, dict[str, str]]:
+    """Module -> module of the same files that it imports, anywhere in it -> the place."""
+    modules = {}
+    for path in paths:
+        parts = path.relative_to(REPOSITORY).with_suffix("").parts
+        modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    found: dict[str, dict[str, str]] = {}
+    for module, path in modules.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Import | ast.ImportFrom):
+                continue
+            names = [alias.name for alias in node.names]
+            if isinstance(node, ast.ImportFrom):
+                assert node.module and not node.level, f"{path}:{node.lineno}: relative import"
+                submodules = [f"{node.module}.{name}" for name in names]
+                names = [name if name in modules else node.module for name in submodules]
+            for name in set(names) & modules.keys() - {module}:
+                found.setdefault(module, {})[name] = f"{path.relative_to(REPOSITORY)}:{node.lineno}"
+    return found
+
+
+@pytest.mark.parametrize("depth", [2, None], ids=["packages", "modules"])
+def test_data_flow_one_way(depth: int | None) -> None:
+    """No module or package below `fourd` reaches itself by imports, those inside functions included."""
+    imports: dict[str, dict[str, str]] = {}
+    for module, targets in imports_among(tracked("fourd/*.py")).items():
+        for target, place in targets.items():
+            first, second = (".".join(name.split(".")[:depth]) for name in (module, target))
+            if first != second:
+                imports.setdefault(first, {})[second] = place
+    try:
+        graphlib.TopologicalSorter(imports).prepare()
+    except graphlib.CycleError as error:
+        # The list names what is imported before what imports it.
+        steps = itertools.pairwise(reversed(error.args[1]))
+        pytest.fail("; ".join(f"{a} imports {b} ({imports[a][b]})" for a, b in steps), pytrace=False)
 
 
 def test_rules_are_small_and_complete() -> None:

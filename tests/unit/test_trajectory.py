@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from fourd import trajectory
-from fourd.arc_path import ArcPath
 from fourd.camera import Camera, CameraTrack, check_camera
 from fourd.config import fill_defaults, validate
 from fourd.errors import InputError
 from fourd.geometry import angle_deg, look_at
-from fourd.paths.presets import place_cameras
 from fourd.trajectory import TrajectorySpec, scene_frames, trajectory_from_mapping
+from fourd.trajectory.arc_path import ArcPath
+from fourd.trajectory.presets import place_cameras
 
 SCHEMA = Path(__file__).resolve().parents[2] / "config" / "schemas" / "trajectories.schema.yaml"
 UP = np.array([0.0, 0.0, 1.0])

@@ -13,9 +13,9 @@ from fourd.errors import InputError
 from fourd.io import read_json, write_json
 from fourd.paths.__main__ import main
 from fourd.paths.files import FORMATS, film_of_view, path_document, read_film, write_film
-from fourd.paths.presets import place_cameras
 from fourd.sfm.cameras import SceneCameras, write_cameras
 from fourd.trajectory import scene_frames, trajectory_from_mapping
+from fourd.trajectory.presets import place_cameras
 from fourd.views import View, virtual_view, write_view
 from tests.unit.test_views import make_scene
 

@@ -12,14 +12,14 @@ from fourd.errors import InputError
 from fourd.geometry import angle_deg
 from fourd.io import write_json
 from fourd.paths.hull import describe_path, describe_view, distance_to_hull
-from fourd.paths.presets import focal_of_fov, fov_of_focal, place_cameras
-from fourd.paths.spline import PoseSpline, even_places, smooth_progress
 from fourd.trajectory import (
     TrajectorySpec,
     resolve_trajectories,
     scene_frames,
     trajectory_from_mapping,
 )
+from fourd.trajectory.presets import focal_of_fov, fov_of_focal, place_cameras
+from fourd.trajectory.spline import PoseSpline, even_places, smooth_progress
 from fourd.views import virtual_view
 from tests.unit.test_trajectory import UP, arc_of, centers_of, scene_of
 from tests.unit.test_views import make_scene
@@ -305,6 +305,15 @@ def test_distance_to_hull_of_known_shapes():
     line = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
     assert distance_to_hull(np.array([2.0, 0.5, 0]), line) == pytest.approx(0.5, abs=1e-6)
     assert distance_to_hull(np.array([2000.0, 500, 0]), 1000 * line) == pytest.approx(500, abs=1e-3)
+
+
+def test_cameras_at_one_place_are_as_far_from_others_as_one():
+    scene = make_scene()
+    cameras = [scene.tracks[name].at(0) for name in scene.inputs]
+    away = dataclasses.replace(cameras[0], t=cameras[0].t + 100)
+    once, twice = describe_view(away, cameras), describe_view(away, [*cameras, *cameras])
+    assert once["is_outside"] and once["spacing"] > 0
+    assert twice["spacing"] == once["spacing"] and twice["reason"] == once["reason"]
 
 
 def test_views_far_from_the_cameras_are_flagged():

@@ -22,13 +22,13 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from fourd.arc_path import ArcPath, average_track, checked_up, common_point
 from fourd.camera import Camera
 from fourd.errors import InputError
 from fourd.geometry import look_at
-from fourd.paths.spline import PoseSpline, even_places, smooth_progress
-from fourd.paths.timing import EASINGS, film_shares, locate
 from fourd.trajectory import TrajectorySpec, bullet_moment, scene_frames
+from fourd.trajectory.arc_path import ArcPath, average_track, checked_up, common_point
+from fourd.trajectory.spline import PoseSpline, even_places, smooth_progress
+from fourd.trajectory.timing import EASINGS, film_shares, locate
 
 if TYPE_CHECKING:
     from fourd.sfm.cameras import SceneCameras

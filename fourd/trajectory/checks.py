@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fourd.errors import InputError
-from fourd.paths.timing import check_eases, check_order, is_number
+from fourd.trajectory.timing import check_eases, check_order, is_number
 
 KEY_NAMES = {"at", "ease", "camera", "position", "rotation", "look_at", "fov_deg"}
 # Key -> lowest and highest value of a number.

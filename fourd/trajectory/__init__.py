@@ -2,8 +2,9 @@
 
 A trajectory has two independent halves: where the view is (`kind` and its keys), and which frame of
 the event is shown (`time`). Paths run through the input cameras' mean places, so the shake of
-hand-held cameras does not enter. The keys are told in docs/paths.md; the poses are placed by
-`fourd.paths.presets`, so that the job graph, which needs the frames only, loads nothing of geometry.
+hand-held cameras does not enter. The keys are told in docs/paths.md. What a film states and shows is
+told here; its poses are placed by `presets`, so that the job graph, which needs the frames only, loads
+nothing of geometry.
 """
 
 import dataclasses
@@ -15,8 +16,8 @@ from typing import Any
 import yaml
 
 from fourd.errors import InputError
-from fourd.paths.checks import check_keys, check_numbers, check_points
-from fourd.paths.timing import check_time, frames_of_keys
+from fourd.trajectory.checks import check_keys, check_numbers, check_points
+from fourd.trajectory.timing import check_time, frames_of_keys
 
 DEFAULT_TRAJECTORIES: dict[str, dict[str, Any]] = {
     "freeze_time": {"kind": "arc", "time": "frozen"},
@@ -35,9 +36,9 @@ class TrajectorySpec:
     kind: `arc` moves from `path_from` to `path_to`, `hold` stays at `position`; all three are
     shares of the path's length, 0 the leftmost camera, 1 the rightmost (lowest and highest, or
     farthest and nearest, where the cameras stand so). `position` None is halfway between the two
-    middle cameras. The other kinds are described in `fourd.paths.presets`.
+    middle cameras. The other kinds are described in `fourd.trajectory.presets`.
     time: `running` shows the whole clip once, `frozen` only `time_frame` (None: the middle one); see
-    `fourd.paths.timing` for the others and for keys
+    `fourd.trajectory.timing` for the others and for keys
     num_frames: of the film; None is the clip's number, twice that of a bullet time
     ease: the view starts and stops smoothly
     file: a path file that says all the rest
