@@ -13,10 +13,13 @@ import cv2
 import numpy as np
 
 from fourd.errors import InputError, explain_faults
+from fourd.io import MAX_IMAGE_SIDE_PX
 
 NUM_DISTORTION = 5
 # Corners of real calibrations fold back by up to half a percent of the picture.
 MAX_FOLDED_SHARE = 0.05
+# Beyond, double precision has no decimals left, and squares soon overflow.
+MAX_NUMBER = 1e15
 
 
 def _zero_distortion() -> np.ndarray:
@@ -143,8 +146,12 @@ def camera_from_dict(document: Mapping[str, Any], size: tuple[int, int], where: 
 
 def check_camera(camera: Camera, where: str) -> None:
     """Raise InputError, naming `where`, unless the camera can be used for geometry."""
-    if not all(np.isfinite(a).all() for a in (camera.K, camera.R, camera.t, camera.distortion)):
-        raise InputError(f"{where}: K, R, t must be finite numbers, got NaN or infinity: fix the calibration")
+    # NaN is not less than anything.
+    if not all((np.abs(a) < MAX_NUMBER).all() for a in (camera.K, camera.R, camera.t, camera.distortion)):
+        raise InputError(
+            f"{where}: K, R, t must be finite numbers below {MAX_NUMBER:.0e}, got NaN, infinity or larger "
+            "ones: fix the calibration"
+        )
     is_upper = abs(camera.K[1, 0]) <= 1e-6 * camera.K[1, 1] and np.allclose(camera.K[2], [0, 0, 1])
     if camera.K[0, 0] <= 0 or camera.K[1, 1] <= 0 or not is_upper:
         raise InputError(
@@ -240,7 +247,7 @@ def _track_from_dict(name: str, entry: Mapping[str, Any], where: str) -> CameraT
     size = (int(entry["size"][0]), int(entry["size"][1]))
     near = float(entry.get("near") or 0.0)
     far = float("inf") if entry.get("far") is None else float(entry["far"])
-    if min(size) < 1 or not entry["frames"] or not 0 <= near < far:
+    if not 1 <= min(size) <= max(size) <= MAX_IMAGE_SIDE_PX or not entry["frames"] or not 0 <= near < far:
         raise ValueError(f"{name}: size {size}, {len(entry['frames'])} frames, near {near}, far {far}")
     cameras = tuple(
         camera_from_dict(frame, size, f"{where}, camera {name}, frame {i}")

@@ -7,6 +7,7 @@ name is always whole. Every file carries `schema_version`.
 import contextlib
 import csv
 import json
+import math
 import os
 import re
 import shutil
@@ -95,9 +96,37 @@ def write_text(path: Path | str, text: str) -> None:
 
 
 def write_json(path: Path | str, document: Mapping[str, Any]) -> None:
-    """Write a JSON object with `schema_version`; NaN and infinity are refused (not JSON)."""
+    """Write a JSON object with `schema_version`. Raises InputError for NaN and infinity (not JSON)."""
     body = {"schema_version": SCHEMA_VERSION, **document}
-    write_text(path, json.dumps(body, indent=1, allow_nan=False) + "\n")
+    write_text(path, json_text(body, path, indent=1) + "\n")
+
+
+def json_text(document: Any, path: Path | str, **style: Any) -> str:
+    """A document as JSON. path: of the file that it is for;  style: of `json.dumps`
+
+    Raises InputError, naming the place, for NaN and infinity.
+    """
+    try:
+        return json.dumps(document, allow_nan=False, **style)
+    except ValueError:
+        for place, value in _numbers_of(document, ""):
+            if not math.isfinite(value):
+                raise InputError(
+                    f"expected finite numbers to write to {path}, got {value} for {place}: what this job "
+                    "read does not determine it, check its inputs"
+                ) from None
+        raise
+
+
+def _numbers_of(document: Any, place: str) -> Iterator[tuple[str, float]]:
+    if isinstance(document, float):
+        yield place, document
+    elif isinstance(document, Mapping):
+        for key, value in document.items():
+            yield from _numbers_of(value, f"{place}.{key}" if place else str(key))
+    elif isinstance(document, list | tuple):
+        for i, value in enumerate(document):
+            yield from _numbers_of(value, f"{place}[{i}]")
 
 
 def read_json(path: Path | str) -> dict[str, Any]:
@@ -114,6 +143,17 @@ def read_json(path: Path | str) -> dict[str, Any]:
         ) from None
     if not isinstance(document, dict):
         raise InputError(f"expected a JSON object in {source}, got a {type(document).__name__}")
+    return document
+
+
+def read_document(path: Path | str) -> dict[str, Any]:
+    """A JSON object that this version of the workflow wrote. Raises InputError as `read_json`, or if not."""
+    document = read_json(path)
+    if document.get("schema_version") != SCHEMA_VERSION:
+        raise InputError(
+            f"{path}: expected schema_version {SCHEMA_VERSION}, got {document.get('schema_version')}: "
+            "delete the file and run again"
+        )
     return document
 
 
@@ -171,13 +211,17 @@ class ArchiveWriter:
             self.add(f"{frame:06d}/{key}", array)
 
     def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
-        if kind is None:
-            text = json.dumps(self._meta, allow_nan=False)
+        if kind is not None:
+            # After a failed write (disk full) closing fails again; the first error is the cause.
+            with contextlib.suppress(OSError):
+                self._zip.close()
+            self._context.__exit__(kind, value, traceback)
+            return
+        with contextlib.ExitStack() as stack:
+            stack.push(self._context)
+            text = json_text(self._meta, self._path)
             self.add("meta", np.frombuffer(text.encode(), dtype=np.uint8))
-        # After a failed write (disk full) closing fails again; the first error is the cause.
-        with contextlib.suppress(OSError) if kind is not None else contextlib.nullcontext():
             self._zip.close()
-        self._context.__exit__(kind, value, traceback)
 
 
 class Archive:
@@ -188,6 +232,8 @@ class Archive:
         try:
             self._zip = zipfile.ZipFile(self.path)
             self.meta: dict[str, Any] = json.loads(self["meta"].tobytes())
+            if not isinstance(self.meta, dict) or self.meta.get("schema_version") != SCHEMA_VERSION:
+                raise ValueError(f"a meta that is not of schema_version {SCHEMA_VERSION}")
         except (zipfile.BadZipFile, KeyError, OSError, ValueError) as error:
             raise InputError(
                 f"expected a whole archive of this workflow at {self.path}, got: {error}; "
@@ -210,6 +256,26 @@ class Archive:
             raise InputError(
                 f"{self.path}: the bytes of {name} are damaged ({error}); delete the file and run again"
             ) from None
+
+    def read(self, name: str, dtype: Any, shape: Sequence[int | None]) -> np.ndarray:
+        """One array of a known form.
+
+        shape: None is any length but 0
+        Raises InputError if there is none of that name, or it is of another type or shape.
+        """
+        if name not in self:
+            raise InputError(f"expected {name} in {self.path}, found none: delete the file and run again")
+        array = self[name]
+        fits = len(array.shape) == len(shape) and all(
+            given == wanted or (wanted is None and given > 0)
+            for given, wanted in zip(array.shape, shape, strict=True)
+        )
+        if not fits or array.dtype != np.dtype(dtype):
+            raise InputError(
+                f"expected {name} of type {np.dtype(dtype)} and shape {tuple(shape)} in {self.path}, got "
+                f"{array.dtype} {array.shape}: delete the file and run again"
+            )
+        return array
 
     def __contains__(self, name: str) -> bool:
         return name in self._names

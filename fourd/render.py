@@ -18,7 +18,7 @@ import numpy as np
 
 from fourd import cli
 from fourd.composition import CascadeOptions
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.io import Archive, atomic_folder, read_image, write_csv, write_png
 from fourd.views import read_view
 
@@ -27,6 +27,9 @@ HOLES_COLUMNS = ("frame", "level", "hole_share", "largest_hole_share", "filled_s
 PROGRESS_INTERVAL_S = 2.0
 # As in `fourd.video.encode`, which need not be loaded to render.
 CODEC_NAMES = ("h264", "hevc", "av1", "prores", "ffv1")
+
+# Type and channels of an estimate's arrays by the last word of their names; the others are bytes.
+_FORMS = {"rgb": (np.uint8, (3,)), "valid": (bool, ()), "filled": (bool, ()), "depth": (np.float32, ())}
 
 logger = logging.getLogger(__name__)
 ItemT = TypeVar("ItemT")
@@ -43,7 +46,9 @@ class BackgroundReader:
     def __init__(self, archive: Archive, keys: Sequence[str]) -> None:
         self._archive = archive
         self._keys = tuple(keys)
-        self._same_as = {int(frame): int(kept) for frame, kept in archive.meta.get("same_as", {}).items()}
+        with explain_faults(f"frames with the same picture in the meta of {archive.path}"):
+            same_as = archive.meta.get("same_as", {})
+            self._same_as = {int(frame): int(kept) for frame, kept in same_as.items()}
         self._last: tuple[int, dict[str, np.ndarray]] | None = None
 
     def frames(self) -> list[int]:
@@ -59,14 +64,23 @@ class BackgroundReader:
 
 
 def read_arrays(archive: Archive, frame: int, keys: Sequence[str]) -> dict[str, np.ndarray]:
-    """Some arrays of one frame, the others unread. Raises InputError if the archive lacks one."""
+    """Some arrays of one frame, the others unread.
+
+    Raises InputError if the archive lacks one, or holds one of another type or size than the others.
+    """
     missing = [key for key in keys if f"{frame:06d}/{key}" not in archive]
     if missing:
         raise InputError(
             f"expected {missing[0]} of frame {frame} in {archive.path}, found none: "
             "delete the file and run again"
         )
-    return {key: archive[f"{frame:06d}/{key}"] for key in keys}
+    arrays: dict[str, np.ndarray] = {}
+    height, width = None, None
+    for key in keys:
+        dtype, channels = _FORMS.get(key.split("_")[-1], (np.uint8, ()))
+        arrays[key] = archive.read(f"{frame:06d}/{key}", dtype, (height, width, *channels))
+        height, width = arrays[key].shape[:2]
+    return arrays
 
 
 def with_progress(items: Sequence[ItemT], what: str) -> Iterator[ItemT]:

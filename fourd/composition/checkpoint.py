@@ -1,5 +1,6 @@
 """Long work kept safe and visible: checkpoints, a request to stop, progress."""
 
+import errno
 import logging
 import pickle
 import signal
@@ -47,7 +48,10 @@ def read_torch(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
         document = torch.load(path, map_location="cpu", weights_only=True)
         for key in keys:
             document[key]
-    except (RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+    except (OSError, RuntimeError, LookupError, TypeError, EOFError, pickle.UnpicklingError) as error:
+        # In a file that was cut off, torch looks for places before its beginning.
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:
+            raise
         reason = " ".join(str(error).split())[:120]
         raise InputError(
             f"expected a whole file of this training in {path}, got: {reason}; delete it and train again"

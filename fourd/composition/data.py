@@ -212,7 +212,8 @@ class SampleSet:
                 f"expected {missing[0]} in {archive.path}, found none: training needs every estimate of a "
                 "physical camera; run fuse and background for it again"
             )
-        return reduce_image(archive[names[0]], archive[names[1]], self._factor)
+        rgb = archive.read(names[0], np.uint8, (None, None, 3))
+        return reduce_image(rgb, archive.read(names[1], bool, rgb.shape[:2]), self._factor)
 
     def _open(self, path: Path) -> Archive:
         if path not in self._archives:

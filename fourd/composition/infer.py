@@ -22,7 +22,7 @@ from fourd.composition.data import (
 )
 from fourd.composition.model import TEST_STREAMS, CompositionNet, resolve_precision
 from fourd.composition.model import paste as paste_streams
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.image import uint8_from_float
 
 CONSENSUS, STATIC = 0, 3
@@ -37,17 +37,21 @@ def load_models(paths: Sequence[Path], device: str = "cpu") -> list[CompositionN
     paths: `composition/{level}/model.pt` of every level, in any order
     Raises InputError if a file is missing, is no model, or the levels are not 0 to the last.
     """
-    documents = sorted(
-        (read_torch(path, MODEL_KEYS) for path in paths), key=lambda document: document["level"]
-    )
-    levels = [document["level"] for document in documents]
-    num_levels = {document["num_levels"] for document in documents}
-    if num_levels != {len(levels)} or levels != list(range(len(levels))):
+    where = ", ".join(map(str, paths))
+    documents = [read_torch(path, MODEL_KEYS) for path in paths]
+    with explain_faults(f"models of this workflow in {where}"):
+        documents.sort(key=lambda document: document["level"])
+        levels = [document["level"] for document in documents]
+        num_levels = sorted({document["num_levels"] for document in documents})
+        if levels != [document["network"]["level"] for document in documents]:
+            raise ValueError("a network of another level than its file")
+    if num_levels != [len(levels)] or levels != list(range(len(levels))):
         raise InputError(
             f"expected one model per level, 0 to the last, got levels {levels} of cascades of "
-            f"{sorted(num_levels)} levels in {', '.join(map(str, paths))}: give the models of one training"
+            f"{num_levels} levels in {where}: give the models of one training"
         )
-    return [_network(document, device) for document in documents]
+    with explain_faults(f"models of this workflow in {where}"):
+        return [_network(document, device) for document in documents]
 
 
 def _network(document: Mapping[str, Any], device: str) -> CompositionNet:
@@ -59,6 +63,10 @@ def _network(document: Mapping[str, Any], device: str) -> CompositionNet:
             f"expected a model of stage version {STAGE_VERSION} for level {document['level']}, got that of "
             f"another network (version {document.get('stage_version', 'unknown')}): train it again"
         ) from None
+    if not all(tensor.isfinite().all() for tensor in network.state_dict().values()):
+        raise InputError(
+            f"expected finite weights for level {document['level']}, got NaN or infinity: train it again"
+        )
     return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 

@@ -11,7 +11,6 @@ from torch.utils.checkpoint import checkpoint
 
 from fourd.errors import InputError
 
-NUM_FOREGROUND = 3
 NUM_STREAMS = 6
 STREAM_CHANNELS = 4
 HEADS = ("blend", "direct")

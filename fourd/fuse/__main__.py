@@ -26,13 +26,20 @@ from fourd.views import read_view
 log = logging.getLogger(__name__)
 
 
+@dataclasses.dataclass(frozen=True)
+class Files:
+    """What the job reads. films: paths, or CAMERA=PATH"""
+
+    view: Path
+    cameras: Path
+    disparity: Sequence[Path]
+    films: Sequence[str]
+    silhouettes: Sequence[Path]
+
+
 def run(
-    view_path: Path,
-    cameras_path: Path,
+    files: Files,
     frames: Sequence[int],
-    disparity_paths: Sequence[Path],
-    films: Sequence[str],
-    silhouette_paths: Sequence[Path],
     estimates: Sequence[str],
     options: FuseOptions,
     hull_options: HullOptions,
@@ -44,12 +51,12 @@ def run(
     A frame without a usable pair or disparity is blank, with the reason in meta `frame_status`.
     Raises InputError for inputs that do not fit together.
     """
-    view = read_view(view_path)
+    view = read_view(files.view)
     frames = view.frames_of(frames)
-    scene = read_cameras(cameras_path)
-    disparities = DisparityFiles(disparity_paths, view.name)
-    pictures = Pictures(films, scene, view.name)
-    silhouettes = Silhouettes(silhouette_paths, view.name)
+    scene = read_cameras(files.cameras)
+    disparities = DisparityFiles(files.disparity, view.name)
+    pictures = Pictures(files.films, scene, view.name)
+    silhouettes = Silhouettes(files.silhouettes, view.name)
     meta: dict[str, Any] = {
         "view": view.name,
         "cameras": list(pictures.names),
@@ -123,14 +130,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     set_num_threads(1)
     # The depth, support and source in the file are those of the consensus.
     estimates = [name for name in ESTIMATES if name in {"consensus", *args.estimates}]
-    for view_path, output in zip(args.view_file, args.output, strict=True):
+    for view, output in zip(args.view_file, args.output, strict=True):
         run(
-            view_path,
-            args.cameras,
+            Files(view, args.cameras, args.disparity, args.films, args.silhouettes),
             args.frames,
-            args.disparity,
-            args.films,
-            args.silhouettes,
             estimates,
             options_from_args(FuseOptions, args),
             options_from_args(HullOptions, args),

@@ -188,7 +188,7 @@ class Silhouettes:
         """name -> (H, W) uint8 mask, 255 moving, 0 background, 128 unknown, at a scene frame."""
         for archive, names, frames in self._archives:
             if frame in frames:
-                return {name: archive[f"{frame:06d}/{name}"] for name in names}
+                return {name: archive.read(f"{frame:06d}/{name}", np.uint8, (None, None)) for name in names}
         return {}
 
     def close(self) -> None:

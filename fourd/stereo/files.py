@@ -1,5 +1,6 @@
 """Files of stage stereo (docs/formats.md): rectification of a pair, disparity of a pair and chunk."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,11 @@ def read_rectification(path: Path | str) -> PairRectification:
         (width, height), (width_right, height_right) = meta["size"], meta["size_right"]
         frames = tuple(
             Rectification.from_arrays(
-                archive.frame(frame), (width, height), (width_right, height_right), meta["obstacle"] or ""
+                archive.frame(frame),
+                (width, height),
+                (width_right, height_right),
+                f"{path}, frame {frame}",
+                meta["obstacle"] or "",
             )
             for frame in archive.frames()
         )
@@ -85,9 +90,9 @@ def read_disparity_frame(archive: Archive, frame: int) -> PairDisparity:
 
     Raises InputError if the pair was refused or the frame is not in the file.
     """
-    if archive.meta["status"] != STATUS_OK:
+    if archive.meta.get("status") != STATUS_OK:
         raise InputError(
-            f"expected disparities in {archive.path}, got a refused pair ({archive.meta['status']}): "
+            f"expected disparities in {archive.path}, got a refused pair ({archive.meta.get('status')}): "
             "leave the pair out"
         )
     try:
@@ -97,15 +102,31 @@ def read_disparity_frame(archive: Archive, frame: int) -> PairDisparity:
             f"expected frame {frame} in {archive.path}, got frames {archive.frames()}: ask for the chunk "
             "that holds it"
         ) from None
-    size, size_right = (arrays[f"{side}_disparity"].shape[::-1] for side in ("left", "right"))
-    return PairDisparity(
-        Rectification.from_arrays(arrays, size, size_right),
-        decode_disparity(arrays["left_disparity"]),
-        decode_disparity(arrays["right_disparity"]),
-        decode_confidence(arrays["left_confidence"]),
-        decode_confidence(arrays["right_confidence"]),
-        float(archive.meta["sigma_px"]),
-    )
+    with explain_faults(f"disparities of this workflow at frame {frame} of {archive.path}"):
+        size, size_right = (_size_of_maps(arrays, side) for side in ("left", "right"))
+        rectification = Rectification.from_arrays(arrays, size, size_right, f"{archive.path}, frame {frame}")
+        sigma_px = float(archive.meta["sigma_px"])
+        if rectification.size_right != size_right or not 0 <= sigma_px < float("inf"):
+            raise ValueError(f"maps of {size} and {size_right} px, sigma_px {sigma_px}")
+        return PairDisparity(
+            rectification,
+            decode_disparity(arrays["left_disparity"]),
+            decode_disparity(arrays["right_disparity"]),
+            decode_confidence(arrays["left_confidence"]),
+            decode_confidence(arrays["right_confidence"]),
+            sigma_px,
+        )
+
+
+def _size_of_maps(arrays: Mapping[str, np.ndarray], side: str) -> tuple[int, int]:
+    """(width, height) px of a side. Raises ValueError for maps of another form."""
+    disparity, confidence = arrays[f"{side}_disparity"], arrays[f"{side}_confidence"]
+    if (disparity.dtype, confidence.dtype) != (np.int16, np.uint8) or disparity.shape != confidence.shape:
+        raise ValueError(
+            f"{side} maps of {disparity.dtype} {disparity.shape} and {confidence.dtype} {confidence.shape}"
+        )
+    height, width = disparity.shape
+    return width, height
 
 
 def encode_disparity(disparity: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from fourd.camera import Camera
+from fourd.camera import Camera, check_camera
 from fourd.errors import InputError
 from fourd.stereo.guard import Guard
 
@@ -125,33 +125,52 @@ class Rectification:
         arrays: Mapping[str, np.ndarray],
         size: tuple[int, int],
         size_right: tuple[int, int],
+        where: str,
         obstacle: str = "",
     ) -> "Rectification":
-        """Inverse of `to_arrays`; the guard, which is kept in meta per pair, is not there."""
+        """Inverse of `to_arrays`; the guard, which is kept in meta per pair, is not there.
+
+        where: file and frame for the error message
+        Raises LookupError, ValueError or InputError for arrays that describe no pair of cameras.
+        """
         swept = None
         if "disparity_range_right" in arrays:
             swept = SweptSides(
-                arrays["R_right"],
+                _numbers(arrays, "R_right", (3, 3)),
                 size_right,
                 _pair_of_floats(arrays["disparity_range_right"]),
                 _pair_of_floats(arrays["inverse_depth_per_px"]),
                 obstacle,
             )
-        return Rectification(
-            arrays["K_left"],
-            arrays["K_right"],
-            arrays["R_left"],
-            arrays["center_left"],
-            arrays["center_right"],
+        rectification = Rectification(
+            _numbers(arrays, "K_left", (3, 3)),
+            _numbers(arrays, "K_right", (3, 3)),
+            _numbers(arrays, "R_left", (3, 3)),
+            _numbers(arrays, "center_left", (3,)),
+            _numbers(arrays, "center_right", (3,)),
             size,
             _pair_of_floats(arrays["disparity_range"]),
             swept=swept,
         )
+        for side in ("left", "right"):
+            check_camera(rectification.camera(side), f"{where}, {side} side")
+        if rectification.baseline == 0:
+            raise ValueError("both sides at one place")
+        return rectification
+
+
+def _numbers(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    array = arrays[name]
+    if array.dtype != np.float64 or array.shape != shape:
+        raise ValueError(f"{name} of {array.dtype} {array.shape}")
+    return array
 
 
 def _pair_of_floats(array: np.ndarray) -> tuple[float, float]:
-    first, second = array
-    return float(first), float(second)
+    first, second = map(float, array)
+    if first != first or second != second:
+        raise ValueError(f"{array.tolist()} for two numbers")
+    return first, second
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

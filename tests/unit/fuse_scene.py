@@ -8,7 +8,7 @@ import numpy as np
 from fourd.camera import Camera, CameraTrack, tracks_to_dict
 from fourd.fuse import FuseOptions, PairFrame
 from fourd.geometry import look_at
-from fourd.io import ArchiveWriter, write_json, write_png
+from fourd.io import Archive, ArchiveWriter, write_json, write_png
 from fourd.stereo.files import encode_confidence, encode_disparity
 from tests.films import put_on_clock
 
@@ -163,6 +163,18 @@ def write_pair(path: Path, pairs: PairFrame | list[PairFrame], frames, status: s
                 baseline=np.linalg.norm(pair.center_right - pair.center_left),
                 disparity_range=np.array([-4.0, 20.0]),
             )  # fmt: skip
+
+
+def change_archive(path: Path, arrays: dict[str, np.ndarray | None], meta: dict | None = None) -> None:
+    """Write an archive again with other arrays, or without those that are None, and other meta."""
+    with Archive(path) as archive:
+        names = [f"{frame:06d}/{key}" for frame in archive.frames() for key in archive.frame(frame)]
+        kept = {name: archive[name] for name in names} | arrays
+        document = archive.meta | (meta or {})
+    with ArchiveWriter(path, document) as writer:
+        for name, array in kept.items():
+            if array is not None:
+                writer.add(name, array)
 
 
 def stage_words(folder: Path, view: str = "orbit", frames: str = "0 1") -> list[str]:

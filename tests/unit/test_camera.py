@@ -179,6 +179,7 @@ def test_track_at_a_frame():
     [
         ({"K": np.full((3, 3), np.nan)}, "finite"),
         ({"t": np.array([0, np.inf, 0])}, "finite"),
+        ({"K": np.array([[400.0, 0, 1e300], [0, 400, 120], [0, 0, 1]])}, "below 1e"),
         ({"K": np.diag([0.0, 400, 1])}, "positive focal lengths"),
         ({"K": np.diag([400.0, -400, 1])}, "positive focal lengths"),
         ({"K": np.diag([400.0, 400, 2])}, "last row 0 0 1"),
@@ -206,3 +207,10 @@ def test_unusable_cameras_are_refused_by_name(change, sentence):
 def test_malformed_entries_are_refused_by_name(document):
     with pytest.raises(InputError, match="here: expected K 3x3"):
         camera_from_dict(document, (320, 240), "here")
+
+
+def test_sizes_that_no_picture_has_are_refused():
+    document = tracks_to_dict({"cam00": CameraTrack("cam00", (make_camera(),))})
+    document["cam00"]["size"][1] = 10**300
+    with pytest.raises(InputError, match="cameras by name in file"):
+        tracks_from_dict(document, "file")

@@ -14,7 +14,9 @@ from fourd.fuse import ESTIMATES, FuseOptions
 from fourd.fuse.__main__ import main
 from fourd.fuse.files import Silhouettes
 from fourd.io import Archive, ArchiveWriter, write_json
-from tests.unit.fuse_scene import SIZE, pair_from_plane, stage_words, write_pair, write_scene
+from tests.unit.fuse_scene import SIZE, change_archive, pair_from_plane, stage_words, write_pair, write_scene
+
+SMALL = np.zeros((4, 24))
 
 
 def test_options_equal_the_schema():
@@ -76,6 +78,31 @@ def test_stage_names_the_missing_frame(tmp_path):
     with pytest.raises(InputError, match="cam00-cam02 at scene frame 1.*frames 0 to 0"):
         main(["foreground", *stage_words(tmp_path), "--device", "cpu", "--output", str(output)])
     assert not output.exists() and not list(tmp_path.glob(".out*"))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "meta"),
+    [
+        ({"K_left": None}, {}),
+        ({"K_left": np.full((3, 3), 1e300)}, {}),
+        ({"K_right": np.zeros((3, 3))}, {}),
+        ({"R_left": np.zeros((3, 3))}, {}),
+        ({"center_left": np.zeros(6)}, {}),
+        ({"center_left": np.array(["x", "y", "z"])}, {}),
+        ({"disparity_range": np.array([np.nan, 1])}, {}),
+        ({"right_disparity": SMALL.astype(np.int16)}, {}),
+        ({"right_disparity": SMALL.astype(np.int16), "right_confidence": SMALL.astype(np.uint8)}, {}),
+        ({"left_disparity": np.zeros(SIZE[::-1])}, {}),
+        ({"left_confidence": np.zeros((1, *SIZE[::-1]), np.uint8)}, {}),
+        ({}, {"sigma_px": [None]}),
+    ],
+)
+def test_stage_names_a_damaged_disparity(tmp_path, arrays, meta):
+    write_scene(tmp_path)
+    path = tmp_path / "disparity" / "cam00-cam01.npz"
+    change_archive(path, {f"000001/{name}": array for name, array in arrays.items()}, meta)
+    with pytest.raises(InputError, match=r"cam00-cam01\.npz"):
+        main(["foreground", *stage_words(tmp_path), "--device", "cpu", "--output", str(tmp_path / "o.npz")])
 
 
 def test_stage_reports_cameras_that_are_not_calibrated(tmp_path):

@@ -30,8 +30,8 @@ def test_json_round_trip_and_faults(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     io.write_json(path, {"x": [1.5, None]})
     assert io.read_json(path) == {"schema_version": io.SCHEMA_VERSION, "x": [1.5, None]}
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        io.write_json(path, {"x": float("nan")})
+    with pytest.raises(InputError, match=r"write to .*a\.json, got nan for x\[1\]\.y"):
+        io.write_json(path, {"x": [1.5, {"y": np.float64("nan")}]})
     assert io.read_json(path)["x"] == [1.5, None]
     path.write_text("{")
     with pytest.raises(InputError, match=r"expected JSON in .*a\.json"):
@@ -69,6 +69,40 @@ def test_cut_archive_is_refused_with_its_name(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(InputError, match=r"whole archive .*cut\.npz.*delete the file"):
         io.Archive(path)
+
+
+def test_a_meta_that_is_no_json_leaves_no_file(tmp_path: Path) -> None:
+    with (
+        pytest.raises(InputError, match=r"a\.npz, got inf for fps"),
+        io.ArchiveWriter(tmp_path / "a.npz", {"fps": float("inf")}) as archive,
+    ):
+        archive.add("x", np.arange(5))
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("meta", ["[]", "1", "{}", '{"schema_version": 9}'])
+def test_archives_of_another_kind_are_refused(tmp_path: Path, meta: str) -> None:
+    np.savez(tmp_path / "other.npz", meta=np.frombuffer(meta.encode(), np.uint8))
+    with pytest.raises(InputError, match=r"whole archive .*other\.npz.* schema_version 1"):
+        io.Archive(tmp_path / "other.npz")
+
+
+def test_arrays_of_another_form_are_refused(tmp_path: Path) -> None:
+    with io.ArchiveWriter(tmp_path / "a.npz") as archive:
+        archive.add("rgb", np.zeros((4, 6, 3), np.uint8))
+        archive.add("none", np.zeros((0, 6, 3), np.uint8))
+    opened = io.Archive(tmp_path / "a.npz")
+    assert opened.read("rgb", np.uint8, (None, 6, 3)).shape == (4, 6, 3)
+    for name, dtype, shape in (
+        ("rgb", np.float32, (None, None, 3)),
+        ("rgb", np.uint8, (None, None)),
+        ("rgb", np.uint8, (5, None, 3)),
+        ("none", np.uint8, (None, None, 3)),
+    ):
+        with pytest.raises(InputError, match=rf"expected {name} of type .*a\.npz, got uint8 \([04], 6, 3\)"):
+            opened.read(name, dtype, shape)
+    with pytest.raises(InputError, match=r"expected depth in .*a\.npz, found none"):
+        opened.read("depth", np.float32, ())
 
 
 def test_damaged_bytes_are_noticed_by_their_checksum(tmp_path: Path) -> None:

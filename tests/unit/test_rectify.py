@@ -183,7 +183,7 @@ class TestRectifiedPair:
             "K_left", "K_right", "R_left", "R_right", "center_left", "center_right", "baseline",
             "disparity_range", "disparity_at_infinity", "inverse_depth_per_px",
         }  # fmt: skip
-        again = Rectification.from_arrays(arrays, rectification.size, rectification.size)
+        again = Rectification.from_arrays(arrays, rectification.size, rectification.size, "here")
         for key, array in again.to_arrays().items():
             np.testing.assert_array_equal(array, arrays[key])
 

@@ -14,6 +14,7 @@ from fourd.composition.checkpoint import save_torch
 from fourd.composition.model import CompositionNet
 from fourd.errors import InputError
 from fourd.video import read_video_frames
+from tests.unit.fuse_scene import change_archive
 
 SIZE = (48, 32)
 FRAMES = (0, 1, 2, 5)
@@ -138,6 +139,57 @@ def test_estimates_of_another_view_or_size_are_refused(estimates, tmp_path):
     make_estimates(estimates, size=(40, 32))
     with pytest.raises(InputError, match="expected pictures of 48 x 32 px"):
         render.main(frames_command(estimates, models, estimates / "out"))
+
+
+@pytest.mark.parametrize(
+    ("file", "arrays", "meta"),
+    [
+        ("foreground", {"000005/consensus_rgb": np.zeros(0, np.uint8)}, {}),
+        ("foreground", {"000002/consensus_valid": np.ones((1, 48), bool)}, {}),
+        ("foreground", {"000002/consensus_rgb": np.full((32, 48, 3), np.inf)}, {}),
+        ("foreground", {"000001/consensus_valid": np.full((32, 48), "x")}, {}),
+        ("background", {"000002/farthest_rgb": np.zeros((32, 48), np.uint8)}, {}),
+        ("background", {}, {"same_as": [2]}),
+        ("background", {}, {"same_as": {"5": None}}),
+    ],
+)
+def test_damaged_estimates_are_named(estimates, file, arrays, meta):
+    change_archive(estimates / f"{file}.npz", arrays, meta)
+    with pytest.raises(InputError, match=rf"{file}\.npz"):
+        render.main(frames_command(estimates, make_models(estimates), estimates / "out"))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"num_levels": None},
+        {"level": ["a"]},
+        {"network": {"level": "x"}},
+        {"network": {"level": 0, "depth": "x"}},
+        {"state_dict": 1.5},
+    ],
+)
+def test_damaged_models_are_named(estimates, change):
+    first, second = make_models(estimates)
+    torch.save({**torch.load(first), **change}, first)
+    with pytest.raises(InputError, match=r"level0\.pt"):
+        render.main(frames_command(estimates, [first, second], estimates / "out"))
+
+
+def test_a_model_without_finite_weights_is_refused(estimates):
+    (path,) = make_models(estimates, 1)
+    document = torch.load(path)
+    next(iter(document["state_dict"].values())).view(-1)[0] = torch.nan
+    torch.save(document, path)
+    with pytest.raises(InputError, match="finite weights for level 0"):
+        render.main(frames_command(estimates, [path], estimates / "out"))
+
+
+def test_a_model_that_was_cut_off_is_named(estimates):
+    (path,) = make_models(estimates, 1)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match=r"whole file of this training in .*level0\.pt"):
+        render.main(frames_command(estimates, [path], estimates / "out"))
 
 
 def test_missing_model_ends_in_one_sentence(estimates, capsys):

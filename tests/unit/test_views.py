@@ -143,7 +143,14 @@ def test_bad_requests_end_in_one_sentence(tmp_path, cameras_path, capsys, argume
 
 @pytest.mark.parametrize(
     "change",
-    [{"role": "other"}, {"size": [0, 3]}, {"frames": [{"frame": 0}]}, {"schema_version": 9}, {"size": 3}],
+    [
+        {"role": "other"},
+        {"size": [0, 3]},
+        {"frames": [{"frame": 0}]},
+        {"schema_version": 9},
+        {"size": 3},
+        {"size": [8, 1e99]},
+    ],
 )
 def test_damaged_view_files_are_named(tmp_path, change):
     path = tmp_path / "cam00.json"
