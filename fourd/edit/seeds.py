@@ -19,6 +19,8 @@ _MIN_MOVING_SHARE, _MIN_DEPTH_SHARE = 0.03, 0.1
 _MOSTLY_MOVING_SHARE = 0.3
 _SAME_SURFACE = 0.02
 _SCENE_VOXEL_PX = 1.5
+# Share of the marked thing's pixels from which something else in a box may have been meant as well.
+_SECOND_SHARE = 0.2
 # A speck behind the thing is no second thing: share of the thing's voxels, and least number.
 _MIN_HIDDEN_SHARE, _MIN_HIDDEN_VOXELS = 0.04, 10
 
@@ -68,7 +70,7 @@ def hints_of_mark(
         told = visible & (marked | ((mark.shape != "scribble") & ~rim[y, x]))
         hint.ravel()[index[told]] = np.where(marked[told], OBJECT, OTHER)
         hints[name] = hint
-    return _drop_passers(instant, hints, side) if mark.shape == "box" else hints
+    return _drop_passers(instant, mark, hints, side) if mark.shape == "box" else hints
 
 
 def _check_mark(mark: Mark, mask: np.ndarray, has_depth: np.ndarray, moving: np.ndarray) -> None:
@@ -93,7 +95,9 @@ def _check_mark(mark: Mark, mask: np.ndarray, has_depth: np.ndarray, moving: np.
         )
 
 
-def _drop_passers(instant: Instant, hints: Mapping[str, np.ndarray], side: float) -> dict[str, np.ndarray]:
+def _drop_passers(
+    instant: Instant, mark: Mark, hints: Mapping[str, np.ndarray], side: float
+) -> dict[str, np.ndarray]:
     """Hints without the parts that a box only touches, and those that lie apart from its largest one."""
     voxels = voxels_of(instant, side)
     parts = find_parts(voxels.centers, side)
@@ -105,13 +109,24 @@ def _drop_passers(instant: Instant, hints: Mapping[str, np.ndarray], side: float
             counts += np.bincount(parts[at[(at >= 0) & (hint == label)]], minlength=num)
     passes = ours < theirs
     if num:
-        passes |= find_strangers(voxels.centers, parts, np.where(passes, 0, ours))
+        inside = np.where(passes, 0, ours)
+        passes |= find_strangers(voxels.centers, parts, inside)
+        _warn_of_others(mark, inside[passes] >= _SECOND_SHARE * inside.max())
     result = {}
     for name, hint in hints.items():
         at = voxels.index[name]
         is_passer = (at >= 0) & passes[parts[np.maximum(at, 0)]] if num else np.zeros(at.shape, bool)
         result[name] = np.where(is_passer & (hint == OBJECT), OTHER, hint).astype(np.uint8)
     return result
+
+
+def _warn_of_others(mark: Mark, is_large: np.ndarray) -> None:
+    if is_large.any():
+        log.warning(
+            "%s holds %d things: the largest is meant; mark another in an edit of its own, or all of them "
+            "with a polygon",
+            mark.describe(), 1 + int(is_large.sum()),
+        )  # fmt: skip
 
 
 def merge_hints(several: list[tuple[Mark, dict[str, np.ndarray]]]) -> dict[str, np.ndarray]:

@@ -134,6 +134,13 @@ def test_a_box_means_what_lies_mostly_inside() -> None:
     assert (label("cam00", 1)[hints["cam00"] == OBJECT] == GREEN).mean() > 0.95
 
 
+def test_a_box_over_two_things_means_one_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    both = np.ones(scene.SIZE[::-1], bool)
+    hints = hints_of_mark(load(1), Mark("cam01", 1, "box"), both, scene.camera("cam01"), SIDE)
+    assert len(np.unique(label("cam01", 1)[hints["cam01"] == OBJECT])) == 1
+    assert "holds 2 things: the largest is meant" in caplog.text
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_a_ball_before_the_marked_thing_is_another_one_and_a_leg_is_not(scale: float) -> None:
     body, leg, ball = np.zeros((9, 3)), np.zeros((6, 3)), np.zeros((3, 3))
