@@ -18,12 +18,15 @@ from fourd.edit.moving import world_points
 from fourd.edit.outline import RIM_PX, refine_outline, widen
 from fourd.edit.plate import FARTHEST, Window, plate_of
 from fourd.edit.voxels import (
+    LOST_SHARE,
     MOVER,
     OBJECT,
     OTHER,
     UNKNOWN,
     MovingVoxels,
+    average_belief,
     distances_to,
+    find_returned,
     find_specks,
     find_strays,
     gather_voxels,
@@ -95,6 +98,18 @@ class Found:
         return Found(masks, kinds, points, rest, still)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Thing:
+    """What the marked frame tells of a thing.
+
+    size: voxels;  is_one: whether what lies apart from it at other times is somebody else's
+    """
+
+    colours: Colours
+    size: int
+    is_one: bool
+
+
 def voxels_of(instant: Instant, side: float) -> MovingVoxels:
     """Moving pixels of all cameras in voxels."""
     points = {}
@@ -128,22 +143,21 @@ def find_frame(
     side: float,
     hints: Mapping[str, np.ndarray],
     before: tuple[np.ndarray, np.ndarray] | None = None,
-    colours: Colours | None = None,
-    is_one: bool = False,
+    thing: Thing | None = None,
 ) -> Found:
     """The thing at one frame, from what each camera believes of it.
 
     hints: camera -> (H, W) uint8 OBJECT, OTHER or UNKNOWN
-    before: points of the thing and of what else moves in the neighbouring frame;  colours: of the thing
-    is_one: whether what lies apart from it is somebody else's
+    before, thing: of any but the marked frame: points of the thing and of what else moves in the
+    neighbouring one, and what the marked one told of it
     """
     voxels = voxels_of(instant, side)
-    beliefs = None if colours is None else {n: colours.of(image) for n, image in instant.images.items()}
-    labels = settle_labels(voxels, vote_labels(voxels, hints, before, beliefs))
-    if is_one:
-        ours = np.flatnonzero(labels == OBJECT)
-        labels[ours[find_strays(voxels.centers[ours], side)]] = OTHER
-    is_speck = find_specks(voxels, labels, before)
+    if thing is None or before is None:
+        labels = settle_labels(voxels, vote_labels(voxels, hints, before))
+        is_speck = find_specks(voxels, labels, before)
+    else:
+        belief = average_belief(voxels, {n: thing.colours.of(image) for n, image in instant.images.items()})
+        labels, is_speck = _label_carried(voxels, hints, before, thing, belief)
     points, others = voxels.centers[labels == OBJECT], voxels.centers[(labels == OTHER) & ~is_speck]
     still = _still_nearby(instant, points, side)
     masks, kinds = {}, {}
@@ -161,6 +175,27 @@ def find_frame(
         sure, theirs_alone = masks[name] & (ours < theirs), is_mover & ~widen(masks[name], RIM_PX)
         kinds[name] = np.where(sure, OBJECT, np.where(theirs_alone, OTHER, UNKNOWN)).astype(np.uint8)
     return Found(masks, kinds, points, others, still)
+
+
+def _label_carried(
+    voxels: MovingVoxels,
+    hints: Mapping[str, np.ndarray],
+    before: tuple[np.ndarray, np.ndarray],
+    thing: Thing,
+    belief: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(V,) uint8 OBJECT or OTHER, and (V,) bool what is not to be handed on, for `find_frame`."""
+    votes = vote_labels(voxels, hints, before, belief)
+    labels = settle_labels(voxels, votes)
+    is_speck = find_specks(voxels, labels, before)
+    if len(before[0]) < LOST_SHARE * thing.size:
+        is_back, is_small = find_returned(voxels, votes, belief, thing.size)
+        labels[is_back] = OBJECT
+        is_speck = (is_speck | is_small) & ~is_back
+    if thing.is_one:
+        ours = np.flatnonzero(labels == OBJECT)
+        labels[ours[find_strays(voxels.centers[ours], voxels.side)]] = OTHER
+    return labels, is_speck
 
 
 def find_rest(instant: Instant, found: Found, side: float) -> Found:
@@ -228,13 +263,12 @@ def carry_mark(
     carry: takes masks from frame to frame, as `carry_flow` does
     """
     carry = carry or carry_flow
-    found = {frame: find_frame(load(frame), side, hints)}
-    kinds = found[frame].kinds
-    colours = learn_colours(
-        load(frame).images, {name: (kind == OBJECT, kind == OTHER) for name, kind in kinds.items()}
-    )
+    first = find_frame(load(frame), side, hints)
+    parts = {name: (kind == OBJECT, kind == OTHER) for name, kind in first.kinds.items()}
     # A ball that flew past goes with who it passed until it is apart again.
-    is_one = is_one_thing(found[frame].points, side)
+    is_one = is_one_thing(first.points, side)
+    thing = Thing(learn_colours(load(frame).images, parts), len(first.points), is_one)
+    found = {frame: first}
     start = list(frames).index(frame)
     for order in (frames[start + 1 :], frames[:start][::-1]):
         before, at = load(frame), frame
@@ -244,9 +278,7 @@ def carry_mark(
                 name: carry(image, before.images[name], found[at].kinds[name])
                 for name, image in instant.images.items()
             }
-            found[now] = find_frame(
-                instant, side, carried, (found[at].points, found[at].others), colours, is_one
-            )
+            found[now] = find_frame(instant, side, carried, (found[at].points, found[at].others), thing)
             before, at = instant, now
             log.info("frame %d: %d voxels", now, len(found[now].points))
     return found

@@ -25,6 +25,9 @@ _ROUNDS = 3
 _SPECK_SHARE = 0.06
 # Share of a figure's size that an arm reaches from it.
 _LIMB_SHARE = 0.25
+# A thing is lost below the first share of its voxels. A new part of at least the second is the thing again
+# if its colours are on average by the third more often the thing's than others' (-1 to 1).
+LOST_SHARE, _RETURN_SHARE, _ALIKE = 0.06, 0.25, 0.15
 # Votes of a colour that only the thing has, or only others have.
 _COLOUR_VOTES = 2.0
 _BITS = 20
@@ -74,13 +77,13 @@ def vote_labels(
     voxels: MovingVoxels,
     masks: Mapping[str, np.ndarray],
     before: tuple[np.ndarray, np.ndarray] | None = None,
-    beliefs: Mapping[str, np.ndarray] | None = None,
+    belief: np.ndarray | None = None,
 ) -> np.ndarray:
     """(V,) uint8 label of every voxel by the majority of the pixels that look at it.
 
     masks: camera -> (H, W) uint8 OBJECT, OTHER or UNKNOWN; a camera that is not named knows nothing
     before: (N, 3) points of the thing and (M, 3) of others in the neighbouring frame; the nearer has a vote
-    beliefs: camera -> (H, W) float32 in -1..1, how much a pixel's colour is the thing's; together one vote
+    belief: (V,) of `average_belief`
     Each camera has one vote per voxel, however many of its pixels lie there.
     """
     num = len(voxels.centers)
@@ -95,16 +98,42 @@ def vote_labels(
     if before is not None:
         ours, theirs = (distances_to(voxels.centers, points, _REACH * voxels.side) for points in before)
         balance += (ours < theirs).astype(float) - (theirs < ours)
-    if beliefs is not None:
-        total, counts = np.zeros(num), np.zeros(num)
-        for name, belief in beliefs.items():
-            at = voxels.index[name]
-            total += np.bincount(at[at >= 0], belief[at >= 0], minlength=num)
-            counts += np.bincount(at[at >= 0], minlength=num)
+    if belief is not None:
         # What nothing else is known about goes with the surface that it is on.
-        voted = (counts > 0) & (balance != 0)
-        balance += _COLOUR_VOTES * np.divide(total, counts, out=np.zeros(num), where=voted)
+        balance += np.where(balance != 0, _COLOUR_VOTES * belief, 0)
     return np.where(balance > 0, OBJECT, np.where(balance < 0, OTHER, UNKNOWN)).astype(np.uint8)
+
+
+def average_belief(voxels: MovingVoxels, beliefs: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(V,) how much the colours of a voxel are the thing's, -1 to 1.
+
+    beliefs: camera -> (H, W) float32 in -1..1
+    """
+    num = len(voxels.centers)
+    total, counts = np.zeros(num), np.zeros(num)
+    for name, belief in beliefs.items():
+        at = voxels.index[name]
+        total += np.bincount(at[at >= 0], belief[at >= 0], minlength=num)
+        counts += np.bincount(at[at >= 0], minlength=num)
+    return np.divide(total, counts, out=np.zeros(num), where=counts > 0)
+
+
+def find_returned(
+    voxels: MovingVoxels, votes: np.ndarray, belief: np.ndarray, size: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Parts that come into view while the thing is lost.
+
+    votes: (V,) of `vote_labels`;  belief: (V,) of `average_belief`;  size: voxels that the thing had
+    Returns (V,) bool what has its colours, and (V,) bool what is too small to be told yet.
+    """
+    if not len(votes):
+        return np.zeros(0, bool), np.zeros(0, bool)
+    parts = find_parts(voxels.centers, voxels.side)
+    counts = np.bincount(parts)
+    is_new = np.bincount(parts, votes == OTHER) < 0.5 * counts
+    is_large = counts >= _RETURN_SHARE * size
+    is_alike = np.bincount(parts, belief) >= _ALIKE * counts
+    return (is_new & is_large & is_alike)[parts], (is_new & ~is_large)[parts]
 
 
 def find_parts(points: np.ndarray, side: float) -> np.ndarray:

@@ -1,12 +1,14 @@
 """A mark through space and time, on a scene whose truth is known."""
 
+import dataclasses
 import functools
 
 import cv2
 import numpy as np
 import pytest
 
-from fourd.edit.carry import VOXEL_PX, carry_flow, carry_mark, find_frame, find_rest, splat_points
+from fourd.edit.carry import VOXEL_PX, Thing, carry_flow, carry_mark, find_frame, find_rest, splat_points
+from fourd.edit.colours import learn_colours
 from fourd.edit.moving import find_moving, project_ideal, sample_depth, world_points
 from fourd.edit.outline import refine_outline
 from fourd.edit.plate import is_no_plate, is_plate, plate_of
@@ -162,11 +164,47 @@ def test_what_was_marked_as_one_thing_stays_one() -> None:
     assert not is_one_thing(np.concatenate([line, ball]), 1.0)
 
 
+def colours_of(number: int):
+    """Colours of a figure against those of the other one."""
+    masks = {cam: (label(cam, 1) == number, label(cam, 1) == GREEN + RED - number) for cam in scene.NAMES}
+    return learn_colours(load(1).images, masks)
+
+
 @pytest.mark.parametrize("is_one", [True, False])
 def test_what_is_apart_again_is_given_back(is_one: bool) -> None:
     hints = {cam: np.where(label(cam, 1) > 0, OBJECT, OTHER).astype(np.uint8) for cam in scene.NAMES}
-    found = find_frame(load(1), SIDE, hints, is_one=is_one)
+    thing = Thing(colours_of(GREEN), 1, is_one)
+    nowhere = np.zeros((0, 3)), np.zeros((0, 3))
+    found = find_frame(load(1), SIDE, hints, nowhere, thing)
     assert iou(found.masks["cam01"], label("cam01", 1) == GREEN if is_one else label("cam01", 1) > 0) > 0.9
+
+
+def hidden(frame: int, numbers: tuple[int, ...]):
+    """An instant in which some figures are not there."""
+    instant = load(frame)
+    moving = {cam: m & ~np.isin(label(cam, frame), numbers) for cam, m in instant.moving.items()}
+    return dataclasses.replace(instant, moving=moving)
+
+
+@pytest.mark.parametrize(("number", "other"), [(GREEN, RED), (RED, GREEN)])
+def test_who_leaves_all_views_and_comes_back_is_found_again(number: int, other: int) -> None:
+    """At frames 3 and 4 nobody is there, then both come at once."""
+    hints = hints_of_mark(
+        load(1), Mark("cam01", 1, "mask"), label("cam01", 1) == number, scene.camera("cam01"), SIDE
+    )
+    found = carry_mark(hints, 1, range(8), lambda f: hidden(f, (GREEN, RED) if f in (3, 4) else ()), SIDE)
+    assert not any(mask.any() for f in (3, 4) for mask in found[f].masks.values())
+    for cam in ("cam00", "cam01", "cam02"):
+        assert iou(found[6].masks[cam], label(cam, 6) == number) > 0.8
+    # And not if only the other one comes.
+    alone = carry_mark(
+        hints,
+        1,
+        range(8),
+        lambda f: hidden(f, (GREEN, RED) if f in (3, 4) else (number,) if f > 4 else ()),
+        SIDE,
+    )
+    assert not any(mask.any() for f in (5, 6, 7) for mask in alone[f].masks.values())
 
 
 def test_noise_that_hangs_on_the_thing_is_no_other_thing() -> None:
