@@ -145,15 +145,17 @@ def run_listen(
     Raises InputError for a camera without an ingest file and for a film that cannot be read.
     """
     names = (*inputs, *heldout)
-    documents = {read_ingest(path)["camera"]: path for path in ingest_paths}
+    read = [(read_ingest(path), path) for path in ingest_paths]
+    documents = {document["camera"]: document for document, _ in read}
+    paths = {document["camera"]: path for document, path in read}
     missing = [name for name in names if name not in documents]
     if missing:
         raise InputError(
             f"expected ingest files of all cameras, got none of {', '.join(missing)}: name them all"
         )
-    pts = {name: np.asarray(read_ingest(documents[name])["pts_s"], dtype=np.float64) for name in names}
+    pts = {name: np.asarray(documents[name]["pts_s"], dtype=np.float64) for name in names}
     too_short = find_too_short(pts, inputs, fps, num_frames)
-    sounds, status = read_sounds([documents[name] for name in names if name not in too_short])
+    sounds, status = read_sounds([paths[name] for name in names if name not in too_short])
     matches = compare_sounds(sounds, inputs, heldout, options)
     offsets = solve_by_sound([match.delay for match in matches], status | too_short, inputs, heldout)
     placed = {name: offsets.clocks[name] for name in inputs if offsets.clocks[name].status == "ok"}

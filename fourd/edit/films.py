@@ -20,7 +20,7 @@ from fourd.edit.origin import find_origin
 from fourd.edit.outline import widen
 from fourd.edit.plate import FARTHEST, NEAREST, plate_of
 from fourd.edit.spec import INSERT, Edit
-from fourd.errors import InputError
+from fourd.errors import InputError, explain_faults
 from fourd.fuse.files import DisparityFiles, Progress
 from fourd.fuse.options import FuseOptions
 from fourd.fuse.view import FusedView, fuse_view
@@ -125,7 +125,10 @@ class Editor:
         self._edit, self._scene, self._view = edit, scene, view
         self._options, self._fuse, self._render = options
         self._masks = stack.enter_context(contextlib.closing(Archive(files.masks)))
-        self._side = float(self._masks.meta["voxel_side"])
+        with explain_faults(f"masks of this workflow in {files.masks}"):
+            self._side = float(self._masks.meta["voxel_side"])
+            light = self._masks.meta["light"]
+            self._light = None if light is None else np.array(light, np.float64)
         self.instants = stack.enter_context(
             contextlib.closing(Instants(scene, files.films, files.depths, self._options.num_times))
         )
@@ -136,8 +139,6 @@ class Editor:
         self._rendered = list_frames(files.rendered) if files.rendered else {}
         self._film = stack.enter_context(contextlib.closing(open_camera(files.film))) if files.film else None
         self.times = self.instants.frames
-        light = self._masks.meta["light"]
-        self._light = None if light is None else np.array(light)
         self._pictures: list[np.ndarray] = []
         self._place: insert.Place | None = None
         if edit.operation == INSERT and edit.pictures is not None:

@@ -16,7 +16,7 @@ NEAREST, FARTHEST = 0.2, 100.0
 _SAME = 0.03
 # A picture is as bright as its plate times 1, give or take noise, or darker in a shadow.
 _NOISE_LEVELS = 14.0
-# More than that beside the best light and place is something else.
+# Grey levels beside the best light and the best place around that are surely something else.
 _SURE_LEVELS = 21.0
 DARKEST_SHADOW = 0.35
 

@@ -111,7 +111,7 @@ def _drop_passers(
     if num:
         inside = np.where(passes, 0, ours)
         passes |= find_strangers(voxels.centers, parts, inside)
-        _warn_of_others(mark, inside[passes] >= _SECOND_SHARE * inside.max())
+        _warn_of_others(mark, inside[passes] > _SECOND_SHARE * inside.max())
     result = {}
     for name, hint in hints.items():
         at = voxels.index[name]

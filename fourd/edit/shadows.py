@@ -10,6 +10,7 @@ from fourd.edit.plate import DARKEST_SHADOW, is_plate
 
 # A shadow leaves at most this share of the light.
 _DARKER = 0.88
+# Directions tried over half the sphere; places of each kind that are looked at, at most and at least.
 _NUM_DIRECTIONS, _NUM_POINTS, _MIN_POINTS = 400, 600, 20
 # Least share of the dark places that the light has to explain beyond what it would darken elsewhere.
 _MIN_SCORE = 0.25

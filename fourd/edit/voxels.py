@@ -141,39 +141,34 @@ def find_parts(points: np.ndarray, side: float) -> np.ndarray:
     return connected_components(_graph(points, side), directed=False)[1].astype(np.int32)
 
 
-def find_strangers(points: np.ndarray, parts: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def find_strangers(
+    points: np.ndarray, parts: np.ndarray, counts: np.ndarray, reach: float = 0.0
+) -> np.ndarray:
     """(P,) bool parts that lie farther from the part with most counts, (P,), than they are long themselves.
 
     points: (V, 3);  parts: (V,) of `find_parts`
+    reach: share of the largest part's own length that is not far yet
     What a missing depth cuts off from a figure is longer than the gap.
     """
-    gaps, lengths = _measure_parts(points, parts, int(counts.argmax()), len(counts))
-    return gaps > lengths
+    main = int(counts.argmax())
+    gaps = np.full(len(counts), np.inf)
+    np.minimum.at(gaps, parts, distances_to(points, points[parts == main], np.inf))
+    low, high = np.full((len(counts), 3), np.inf), np.full((len(counts), 3), -np.inf)
+    np.minimum.at(low, parts, points)
+    np.maximum.at(high, parts, points)
+    lengths = np.linalg.norm(high - low, axis=1)
+    return gaps > np.maximum(lengths, reach * lengths[main])
 
 
 def find_strays(points: np.ndarray, side: float) -> np.ndarray:
     """(V,) bool points of a thing, (V, 3), that lie apart from most of it and belong to somebody else.
 
-    They are farther away than they are long, and than a limb reaches: a hand whose arm has no depth stays.
+    They are farther away than a limb reaches: a hand whose arm has no depth stays.
     """
     if not len(points):
         return np.zeros(0, bool)
     parts = find_parts(points, side)
-    counts = np.bincount(parts)
-    gaps, lengths = _measure_parts(points, parts, int(counts.argmax()), len(counts))
-    return (gaps > np.maximum(lengths, _LIMB_SHARE * lengths[counts.argmax()]))[parts]
-
-
-def _measure_parts(
-    points: np.ndarray, parts: np.ndarray, main: int, num: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """(P,) distances of all parts to one of them, and (P,) diagonals of their boxes."""
-    gaps = np.full(num, np.inf)
-    np.minimum.at(gaps, parts, distances_to(points, points[parts == main], np.inf))
-    low, high = np.full((num, 3), np.inf), np.full((num, 3), -np.inf)
-    np.minimum.at(low, parts, points)
-    np.maximum.at(high, parts, points)
-    return gaps, np.linalg.norm(high - low, axis=1)
+    return find_strangers(points, parts, np.bincount(parts), _LIMB_SHARE)[parts]
 
 
 def is_one_thing(points: np.ndarray, side: float) -> bool:
@@ -213,8 +208,6 @@ def distances_to(points: np.ndarray, targets: np.ndarray, most: float) -> np.nda
 def _graph(points: np.ndarray, side: float) -> csr_matrix:
     """(V, V) distances of voxels that touch, both ways. points: (V, 3) centres"""
     num = len(points)
-    if not num:
-        return csr_matrix((0, 0))
     pairs = KDTree(points).query_pairs(_REACH * side, output_type="ndarray")
     lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     # A length of exactly 0 would be no edge.

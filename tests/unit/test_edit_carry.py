@@ -143,6 +143,14 @@ def test_a_box_over_two_things_means_one_and_says_so(caplog: pytest.LogCaptureFi
     assert "holds 2 things: the largest is meant" in caplog.text
 
 
+def test_a_box_that_holds_nothing_does_not_count_what_it_touches(caplog: pytest.LogCaptureFixture) -> None:
+    y, x = np.nonzero(label("cam01", 1) == GREEN)
+    corner = np.zeros(scene.SIZE[::-1], bool)
+    corner[y.min() : y.min() + 4, x.min() : x.min() + 4] = True
+    hints = hints_of_mark(load(1), Mark("cam01", 1, "box"), corner, scene.camera("cam01"), SIDE)
+    assert not any((hint == OBJECT).any() for hint in hints.values()) and "holds" not in caplog.text
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_a_ball_before_the_marked_thing_is_another_one_and_a_leg_is_not(scale: float) -> None:
     body, leg, ball = np.zeros((9, 3)), np.zeros((6, 3)), np.zeros((3, 3))
